@@ -1,0 +1,48 @@
+# The commands of the README. Each does whatever set-up is still missing (bootstrap.py), then its job.
+
+PYTHON ?= python3
+VENV := .venv
+ARGS ?=
+
+# A shell in which another ROS or another environment is sourced must not mix with this one: its packages would be
+# imported before ours, and the wheels search the directories of LD_LIBRARY_PATH in no fixed order.
+unexport PYTHONPATH PYTHONHOME LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE AMENT_PREFIX_PATH
+
+.DEFAULT_GOAL := help
+.PHONY: help setup train test lint format clean
+
+help:
+	@echo "make train    set up what is missing, then learn the default task and watch it    (codetr train)"
+	@echo "make test     set up what is missing, then run all tests, lint and types included (pytest)"
+	@echo "make lint     lint, format and type checks alone"
+	@echo "make format   put the code into the house format"
+	@echo "make setup    the set-up alone, into $(VENV)"
+	@echo "make clean    remove $(VENV) and every cache; runs are kept"
+	@echo
+	@echo "ARGS='...' is passed on:  make train ARGS='--config cpu --task Hopper-v5'   make test ARGS='-m \"not slow\"'"
+	@echo "PYTHON=... chooses the interpreter (3.10 to 3.13):  make test PYTHON=python3.12"
+
+setup:
+	@command -v '$(PYTHON)' >/dev/null 2>&1 || { echo "set-up: there is no command '$(PYTHON)'. Install Python 3.10\
+	to 3.13 (Debian, Ubuntu: apt install python3 python3-venv python3-dev) or name one that you have:\
+	make test PYTHON=/path/to/python3.12" >&2; exit 1; }
+	@'$(PYTHON)' bootstrap.py
+
+train: setup
+	@$(VENV)/bin/codetr train $(ARGS)
+
+test: setup
+	@$(VENV)/bin/python -m pytest tests $(ARGS)
+
+lint: setup
+	@$(VENV)/bin/ruff check .
+	@$(VENV)/bin/ruff format --check .
+	@$(VENV)/bin/mypy
+
+format: setup
+	@$(VENV)/bin/ruff format .
+	@$(VENV)/bin/ruff check --fix .
+
+clean:
+	rm -rf $(VENV) .hypothesis .mypy_cache .pytest_cache .ruff_cache MUJOCO_LOG.TXT
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,170 @@
+"""Are the inferred step rewards the true ones? Reward recovery on held-out episodes of HalfCheetah.
+
+    .venv/bin/python benchmarks/reward_recovery.py --out benchmarks/results/reward_recovery.csv
+
+The data is the replay of a true-reward run of 20 000 steps (small networks), so that it ranges from random to
+running. Four fifths of its episodes train each model on nothing but composite rewards of 25 steps; the last fifth,
+every fifth episode, is held out. For each composite reward and each variant of the model it gives
+
+    composite_r2       R^2 of the predicted composite reward
+    pearson, spearman  correlation of inferred and true step rewards
+    within_pearson     the same with each segment's mean removed from both: is credit right inside the segment?
+    within_spearman
+    weights_sd         standard deviation of the attention weights w (1 on average)
+
+over held-out steps. A high R^2 says little about the steps, which is why the others are here.
+Rows that are in the file already are not run again.
+"""
+
+import argparse
+import csv
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy import stats
+
+from codetr_ros import in_process
+from codetr_ros.composite import composite
+from codetr_ros.config import Settings, load
+from codetr_ros.records import CompositeReward, Record, Transitions, TrueRewards
+from codetr_ros.rewards.codetr import Codetr
+from codetr_ros.rewards.method import segment_steps
+from codetr_ros.seeding import generator, seed_torch
+from codetr_ros.trajectories import Trajectories
+
+DELAY = 25
+COMPOSITES = ('sum', 'sum_square', 'square_sum', 'max')
+VARIANTS: dict[str, dict[str, object]] = {
+    'as shipped': {},
+    'label rhat': {'codetr.label': 'rhat'},
+    'weights one': {'codetr.weights': 'one'},
+    'head scale inverse': {'codetr.head_scale': 'inverse'},
+    'head scale inverse, label rhat': {'codetr.head_scale': 'inverse', 'codetr.label': 'rhat'},
+    'head scale one': {'codetr.head_scale': 'one'},
+    'pair tokens': {'codetr.tokens': 'pair'},
+    'dropout 0.1': {'codetr.dropout': 0.1},
+    'learning rate 3e-4': {'codetr.learning_rate': 3e-4},
+    'raw observations': {'codetr.normalise_observations': False},
+    'raw targets': {'target_scale': 'none'},
+    'context episode': {'codetr.context': 'episode', 'codetr.window': 50},
+}
+COLUMNS = (
+    'composite', 'variant', 'seed', 'gradient_steps', 'composite_r2', 'pearson', 'spearman', 'within_pearson',
+    'within_spearman', 'weights_sd', 'seconds', 'commit',
+)  # fmt: skip
+
+
+def replay(cache: Path, steps: int = 20_000) -> dict[str, np.ndarray]:
+    """The true-reward run's steps: made once, kept in `cache`."""
+    if not cache.is_file():
+        settings = load('quick').changed(
+            {'task': 'HalfCheetah-v5', 'method': 'true', 'steps': steps, 'warmup_steps': 1000, 'evaluate_every': 5000}
+        )
+        seen: list[Record] = []
+        in_process.run(settings, 'replay', observe=seen.append)
+        chunks = [r for r in seen if isinstance(r, Transitions)]
+        true = [r for r in seen if isinstance(r, TrueRewards)]
+        cache.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(
+            cache,
+            observations=np.concatenate([c.observations[:-1] for c in chunks]),
+            finals=np.array([c.observations[-1] for c in chunks if c.truncated or c.terminated]),
+            actions=np.concatenate([c.actions for c in chunks]),
+            rewards=np.concatenate([t.rewards for t in true]),
+            episodes=np.concatenate([np.full(c.steps, c.episode) for c in chunks]),
+        )
+    with np.load(cache) as data:
+        return dict(data)
+
+
+def memories(data: dict[str, np.ndarray], settings: Settings) -> tuple[Trajectories, Trajectories]:
+    """Training and held-out episodes as memories D, scored with the settings' composite reward."""
+    sizes = data['observations'].shape[1], data['actions'].shape[1]
+    made = [Trajectories(*sizes, DELAY, len(data['rewards']), 1000, true_rewards=True) for _ in range(2)]
+    counts = [0, 0]
+    for episode in range(len(data['finals'])):
+        rows = np.flatnonzero(data['episodes'] == episode)
+        side = int(episode % 5 == 4)
+        number, memory = counts[side], made[side]
+        counts[side] += 1
+        observations = np.concatenate([data['observations'][rows], data['finals'][episode][None]])
+        n = len(rows)
+        memory.append(
+            Transitions('', 's', number, 0, number, 0, n, observations, data['actions'][rows], False, True, False, 0)
+        )
+        true = data['rewards'][rows]
+        memory.append_true_rewards(TrueRewards('', 's', number, 0, number, 0, true))
+        for first in range(0, n, DELAY):
+            part = true[first : first + DELAY].astype(np.float64)
+            value = composite(settings.composite, part, settings.beta, DELAY)
+            memory.score(CompositeReward('', 's', 's', 0, number, first, len(part), value))
+    return made[0], made[1]
+
+
+def measure(data: dict[str, np.ndarray], settings: Settings, gradient_steps: int) -> dict[str, float]:
+    """Fit on the training episodes, compare on the held-out ones."""
+    train, held_out = memories(data, settings)
+    method = Codetr(settings, train.observation_size, train.action_size)
+    method.prepare(train)
+    for i in range(gradient_steps):
+        seed_torch(settings.seed, 'recovery', i)
+        method.gradient_step(train, generator(settings.seed, 'recovery', i))
+    batch = held_out.segment_batch(held_out.segment_ids(), method.context)
+    assert batch.true_rewards is not None
+    inside = segment_steps(batch)
+    weights, _ = method.components(batch)
+    labels = method.label(batch).astype(np.float64)
+    true = np.where(inside, batch.true_rewards, 0).astype(np.float64)
+    residual = method.predict(batch) - batch.values
+    n = inside.sum(1, keepdims=True)
+    centred = [(x - x.sum(1, keepdims=True) / n)[inside] for x in (labels, true)]
+    return {
+        'composite_r2': 1 - (residual**2).sum() / ((batch.values - batch.values.mean()) ** 2).sum(),
+        'pearson': stats.pearsonr(labels[inside], true[inside]).statistic,
+        'spearman': stats.spearmanr(labels[inside], true[inside]).statistic,
+        'within_pearson': stats.pearsonr(*centred).statistic,
+        'within_spearman': stats.spearmanr(*centred).statistic,
+        'weights_sd': float(weights[inside].std()),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--out', type=Path, default=Path('benchmarks/results/reward_recovery.csv'))
+    parser.add_argument('--cache', type=Path, default=Path('.venv/cache/reward_recovery_replay.npz'))
+    parser.add_argument('--composites', nargs='+', default=list(COMPOSITES), choices=COMPOSITES)
+    parser.add_argument('--variants', nargs='+', default=list(VARIANTS), choices=list(VARIANTS))
+    parser.add_argument('--seeds', nargs='+', type=int, default=[0, 1, 2])
+    parser.add_argument('--gradient-steps', nargs='+', type=int, default=[400])
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    commit = subprocess.run(['git', 'rev-parse', '--short', 'HEAD'], capture_output=True, text=True).stdout.strip()
+    data = replay(arguments.cache)
+    done = set()
+    if arguments.out.is_file():
+        with arguments.out.open() as file:
+            done = {(r['composite'], r['variant'], r['seed'], r['gradient_steps']) for r in csv.DictReader(file)}
+    else:
+        arguments.out.write_text(','.join(COLUMNS) + '\n')
+    for steps in arguments.gradient_steps:
+        for seed in arguments.seeds:
+            for name in arguments.composites:
+                for variant in arguments.variants:
+                    key = (name, variant, str(seed), str(steps))
+                    if key in done:
+                        continue
+                    began = time.perf_counter()
+                    changes = {'composite': name, 'delay': DELAY, 'seed': seed} | VARIANTS[variant]
+                    row = measure(data, load('quick').changed(changes), steps)
+                    numbers = [f'{value:.3f}' for value in row.values()]
+                    line = [*key, *numbers, f'{time.perf_counter() - began:.1f}', commit]
+                    with arguments.out.open('a') as file:
+                        csv.writer(file, lineterminator='\n').writerow(line)
+                    print(*line, flush=True)
+
+
+if __name__ == '__main__':
+    main()

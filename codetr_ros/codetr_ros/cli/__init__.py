@@ -1,0 +1,89 @@
+"""The command `codetr`. Everything slow to import is imported by the command that needs it."""
+
+import sys
+from collections.abc import Callable, Sequence
+
+USAGE = 2
+"""Exit code for what the user can mend on the command line, as argparse has it."""
+FAILED = 1
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it: 128 + SIGINT."""
+
+HELP = """usage: codetr COMMAND [OPTIONS]
+
+Learn a task from composite delayed rewards, with ROS 2 nodes or in one process.
+
+commands:
+  train      train on a task: starts all nodes, shows progress, ends with a report
+  evaluate   evaluate the policy of a run's newest checkpoint
+  tasks      list the tasks that have a name
+  doctor     check Python, ROS, discovery, shared memory, torch and MuJoCo
+
+`codetr COMMAND --help` explains the options of a command.
+"""
+
+
+def _train(arguments: Sequence[str]) -> int:
+    from codetr_ros.cli import train
+
+    return train.main(arguments)
+
+
+def _evaluate(arguments: Sequence[str]) -> int:
+    from codetr_ros.cli import evaluate
+
+    return evaluate.main(arguments)
+
+
+def _tasks(arguments: Sequence[str]) -> int:
+    from codetr_ros.cli import list_tasks
+
+    return list_tasks.main(arguments)
+
+
+def _doctor(arguments: Sequence[str]) -> int:
+    from codetr_ros import doctor
+
+    return doctor.main(arguments)
+
+
+COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
+    'train': _train,
+    'evaluate': _evaluate,
+    'tasks': _tasks,
+    'doctor': _doctor,
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        arguments: without the program's name; by default those of this process.
+
+    Returns:
+        The exit code: 0 done, 1 failed, 2 refused, 130 interrupted.
+    """
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if not given or given[0] in ('-h', '--help', 'help'):
+        # Asked for, it is the output; not asked for, it is the complaint.
+        print(HELP, end='', file=sys.stdout if given else sys.stderr)
+        return 0 if given else USAGE
+    command = COMMANDS.get(given[0])
+    if command is None:
+        return refuse(f'there is no command {given[0]!r}: commands are {", ".join(COMMANDS)}')
+    try:
+        return command(given[1:])
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except BrokenPipeError:
+        # Whoever read our output (`| head`) has gone; nothing to tell anybody. Without this, the
+        # interpreter complains once more when it flushes at exit.
+        sys.stdout = None
+        return FAILED
+
+
+def refuse(text: str) -> int:
+    """Say why a command was not carried out; the exit code for it."""
+    print(f'codetr: {text}', file=sys.stderr)
+    return USAGE

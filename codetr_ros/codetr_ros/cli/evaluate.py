@@ -1,0 +1,148 @@
+"""`codetr evaluate`: how good is the policy of a run's newest checkpoint?"""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from codetr_ros import run_folder
+from codetr_ros.cli import refuse
+from codetr_ros.config import Settings, SettingsError
+from codetr_ros.records import EpisodeResult, Policy
+from codetr_ros.run_folder import RunFolderError
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Evaluate the policy of a run's newest checkpoint, without noise, and print a table.
+
+    With the run's own seed (the default) the episodes begin where those of its evaluations began.
+    """
+
+    run_dir: Annotated[
+        str, tyro.conf.Positional, tyro.conf.arg(metavar='RUN_DIR', help="the run's folder")
+    ]
+    episodes: Annotated[
+        int | None,
+        tyro.conf.arg(metavar='N', help="how many; as the run's evaluations if not given"),
+    ] = None
+    seed: Annotated[
+        int | None, tyro.conf.arg(metavar='K', help="of the start states; the run's if not given")
+    ] = None
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Evaluate and print; the exit code."""
+    given = tyro.cli(Arguments, prog='codetr evaluate', args=arguments)
+    folder = Path(given.run_dir)
+    try:
+        settings = run_folder.read_settings(folder)
+        changes: dict[str, int] = {'evaluate_every': 1}
+        if given.episodes is not None:
+            changes['evaluate_episodes'] = given.episodes
+        if given.seed is not None:
+            changes['seed'] = given.seed
+        settings = settings.changed(changes, 'command line')
+    except (RunFolderError, SettingsError) as error:
+        return refuse(str(error))
+
+    from codetr_ros.checkpoints import CheckpointError
+    from codetr_ros.tasks import TaskError
+
+    try:
+        policy = newest_policy(folder, settings)
+        results = evaluate(policy, settings)
+    except (RunFolderError, CheckpointError, TaskError) as error:
+        return refuse(str(error))
+    console = Console()
+    console.print(
+        f'{settings.task}: policy after {settings.steps_after(policy.version)} steps, '
+        f'{len(results)} episodes, seed {settings.seed}',
+        highlight=False,
+    )
+    console.print(table(results))
+    return 0
+
+
+def newest_policy(folder: Path, settings: Settings) -> Policy:
+    """The policy of the learner's newest checkpoint, as the learner would publish it.
+
+    Raises:
+        RunFolderError: there is no checkpoint, or none with a policy that has learnt.
+        CheckpointError: the checkpoint is damaged.
+    """
+    from codetr_ros import checkpoints
+    from codetr_ros.learners import network
+    from codetr_ros.learners.sac import SAC
+
+    place = folder / run_folder.CHECKPOINTS
+    path = checkpoints.latest(place, 'learner')
+    if path is None:
+        raise RunFolderError(
+            f'{place} holds no checkpoint of the learner: let the run get past its warm-up '
+            f'({settings.warmup_steps} steps)'
+        )
+    tensors, meta = checkpoints.load(path)
+    phase = checkpoints.phase_of(path)
+    if not settings.evaluated(phase):
+        raise RunFolderError(
+            f'{path} is from the warm-up ({settings.warmup_steps} steps): '
+            'its policy has learnt nothing yet'
+        )
+    sizes = meta['observation_size'], meta['action_size']
+    sac = SAC(*sizes, settings.sac, settings.seed)
+    sac.load_state({name: t for name, t in tensors.items() if not name.startswith('labels/')})
+    return Policy(
+        run_id='evaluate',
+        phase=phase + settings.lag,
+        version=phase,
+        sources=(),
+        steps=np.zeros(0, np.uint32),
+        random=False,
+        network=network.describe(*sizes, settings.sac.hidden),
+        weights=network.weights_bytes(sac.actor),
+    )
+
+
+def evaluate(policy: Policy, settings: Settings) -> list[EpisodeResult]:
+    """`settings.evaluate_episodes` episodes of this policy, without noise."""
+    import torch
+
+    from codetr_ros.evaluation import Evaluator
+
+    torch.set_num_threads(settings.threads)
+    evaluator = Evaluator(settings.run_spec(policy.run_id), settings, 'evaluate')
+    evaluator.receive(policy)
+    results: list[EpisodeResult] = []
+    try:
+        for records in evaluator.work():
+            if records is None:
+                break
+            results += [record for record in records if isinstance(record, EpisodeResult)]
+    finally:
+        evaluator.close()
+    return results
+
+
+def table(results: Sequence[EpisodeResult]) -> Table:
+    """Mean and spread of what the episodes earned."""
+    shown = Table(box=None, pad_edge=False)
+    shown.add_column('')
+    for name in ('mean', 'std', 'min', 'max'):
+        shown.add_column(name, justify='right')
+    rows = (
+        ('true return', [r.true_return for r in results]),
+        ('composite return', [r.composite_return for r in results]),
+        ('score', [r.score for r in results]),
+        ('length', [r.length for r in results]),
+    )
+    for name, values in rows:
+        array = np.array(values)
+        spread = (array.mean(), array.std(), array.min(), array.max())
+        shown.add_row(name, *(f'{value:.6g}' for value in spread))
+    return shown

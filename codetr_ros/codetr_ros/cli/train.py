@@ -1,0 +1,273 @@
+"""`codetr train`: start everything, show how it goes, end with a summary and a report."""
+
+import dataclasses
+import os
+import re
+import secrets
+import time
+import traceback
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from codetr_ros import config, launcher, report, run_folder
+from codetr_ros.cli import FAILED, INTERRUPTED, refuse
+from codetr_ros.cli.flags import parse
+from codetr_ros.cli.supervise import Interrupts, Silence, supervise, why_it_gave_up
+from codetr_ros.config import Settings, SettingsError
+from codetr_ros.launcher import LaunchError
+from codetr_ros.progress import Progress
+from codetr_ros.records import Record
+from codetr_ros.run_folder import RunFolderError
+from codetr_ros.summary import Summary
+from codetr_ros.summary import write as write_summary
+
+DESCRIPTION = """Train on a task.
+
+Starts a simulator, an evaluator, the reward model, the learner and a recorder as ROS 2 nodes in a
+namespace of their own, shows how they do, and ends with a summary, a report and a picture. Ctrl-C
+ends all of it cleanly. Every setting is a flag; --config decides the defaults of all others."""
+
+
+@dataclasses.dataclass
+class Outcome:
+    """How a run ended."""
+
+    reports: Mapping[str, Mapping[str, Any]]
+    interrupted: bool = False
+    failure: str | None = None
+    log: Path | None = None  # where the failure is explained
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Train as the command line says; the exit code."""
+    from codetr_ros import tasks
+
+    more = [
+        (
+            'out',
+            Annotated[
+                str | None,
+                tyro.conf.arg(
+                    metavar='DIR',
+                    help='output folder, new or empty; by default '
+                    'runs/<task>-<method>-<seed>-<time>',
+                ),
+            ],
+            None,
+        ),
+        (
+            'in_process',
+            Annotated[
+                bool,
+                tyro.conf.arg(help='no nodes and no topics: the same run with plain calls'),
+            ],
+            False,
+        ),
+    ]
+    try:
+        settings, extra = parse(arguments, 'codetr train', DESCRIPTION, 'quick', more)
+        in_process = extra['in_process']
+        if settings.method in config.IN_PROCESS_ONLY and not in_process:
+            return refuse(
+                f'--method {settings.method} is a reference that looks at what no node may see: '
+                'it runs in process only. Add --in-process, or choose another --method'
+            )
+        tasks.check(settings, tasks.find(settings.task))
+        if not in_process:
+            for role in launcher.EXECUTABLES:
+                launcher.executable(role)
+        stamp = time.strftime('%Y%m%d-%H%M%S')
+        folder = run_folder.create(Path(extra['out'] or default_out(settings, stamp)))
+    except (SettingsError, tasks.TaskError, RunFolderError, LaunchError) as error:
+        return refuse(str(error))
+    # Letters first: as a ROS parameter and part of a namespace it must not read as a number.
+    run_id = f'r{stamp.replace("-", "_")}_{secrets.token_hex(2)}'
+    return train(settings, run_id, folder, in_process)
+
+
+def default_out(settings: Settings, stamp: str) -> str:
+    """The output folder where none is given."""
+    task = re.sub(r'[^A-Za-z0-9_.-]+', '_', settings.task)
+    return f'runs/{task}-{settings.method}-{settings.seed}-{stamp}'
+
+
+def train(settings: Settings, run_id: str, folder: Path, in_process: bool) -> int:
+    """Run it, and leave everything about it in its folder.
+
+    Args:
+        settings: the run's settings.
+        run_id: its name: letters, digits and `_`.
+        folder: its folder, made.
+        in_process: without nodes.
+
+    Returns:
+        The exit code: 0 finished, 1 failed, 130 interrupted.
+    """
+    run_folder.write_settings(folder, settings)
+    summary = Summary(settings, run_id, in_process)
+    progress = Progress(settings)
+    progress.say(
+        f'{settings.task}: {settings.composite} of {settings.delay} steps, method '
+        f'{settings.method}, {settings.steps} steps, seed {settings.seed}'
+        + (', in process' if in_process else '')
+    )
+    progress.say(f'output: {_short(folder)}')
+    with Interrupts() as interrupts:
+        with progress:
+            way = _in_process if in_process else _over_topics
+            outcome = way(settings, run_id, folder, summary, progress, interrupts)
+        bag = folder / run_folder.BAG
+        built = summary.build(
+            outcome.reports, bag if bag.is_dir() else None, outcome.interrupted, outcome.failure
+        )
+        write_summary(folder, built, summary.metrics_csv())
+        report.write(folder, built)
+    show(built, folder, Console())
+    if outcome.failure:
+        say_failure(outcome)
+        return FAILED
+    return INTERRUPTED if outcome.interrupted else 0
+
+
+def _in_process(
+    settings: Settings,
+    run_id: str,
+    folder: Path,
+    summary: Summary,
+    progress: Progress,
+    interrupts: Interrupts,
+) -> Outcome:
+    # Before torch is imported: the same threads as the nodes have, for the same bits.
+    os.environ.update(launcher.threading_environment(settings))
+    from codetr_ros import in_process
+
+    def observe(record: Record) -> None:
+        summary.receive(record)
+        progress.receive(record)
+        if interrupts.count:
+            raise KeyboardInterrupt
+
+    # A slice may be long: whoever asks twice does not wait for its end.
+    interrupts.raising = True
+    try:
+        return Outcome(in_process.run(settings, run_id, folder, observe))
+    except KeyboardInterrupt:
+        progress.say('stopped')
+        return Outcome(run_folder.read_reports(folder), interrupted=True)
+    except Exception as error:
+        # Whatever it was: what was learnt until now is worth a summary, which names the failure.
+        log = folder / run_folder.LOGS / 'in_process.log'
+        run_folder.atomic_write(log, traceback.format_exc())
+        reports = run_folder.read_reports(folder)
+        return Outcome(reports, failure=f'{type(error).__name__}: {error}', log=log)
+    finally:
+        interrupts.raising = False
+
+
+def _over_topics(
+    settings: Settings,
+    run_id: str,
+    folder: Path,
+    summary: Summary,
+    progress: Progress,
+    interrupts: Interrupts,
+) -> Outcome:
+    commands = launcher.commands(settings, run_id, folder)
+    environment = launcher.environment(settings)
+    # For the watcher, which lives in this process: it must look where the nodes are.
+    os.environ.update(
+        {name: v for name, v in environment.items() if name.startswith(('ROS_', 'RMW_'))}
+    )
+    try:
+        from codetr_ros.ros.watch import Watcher
+    except ImportError as error:
+        return Outcome(
+            {},
+            failure=f'ROS cannot be imported ({error}): `codetr doctor` says what is missing; '
+            '--in-process trains without ROS',
+        )
+    silence = Silence()
+
+    def receive(record: Record) -> None:
+        silence.receive(record)
+        summary.receive(record)
+        progress.receive(record)
+
+    failure = None
+    with launcher.Processes(progress.say, interrupts.again) as processes:
+        try:
+            # The watcher first: what the nodes say from their start on is to be heard.
+            with Watcher(receive, f'/run_{run_id}') as watcher:
+                processes.start(commands, folder / run_folder.LOGS, environment)
+                failure = supervise(
+                    processes,
+                    lambda: watcher.poll(0.1),
+                    interrupts,
+                    silence,
+                    lambda node: why_it_gave_up(node, folder),
+                )
+                watcher.poll(0.0)  # the last words of the last node
+        except LaunchError as error:
+            failure = str(error)
+    reports = run_folder.read_reports(folder)
+    for node in processes.nodes:
+        key = run_folder.report_path(folder, node.role, node.name).stem
+        reports.setdefault(key, {'role': node.role, 'name': node.name})
+        reports[key]['exit_code'] = node.code
+    culprit = next((node.log for node in processes.nodes if node.unasked_failure), None)
+    return Outcome(reports, bool(interrupts.count), failure, culprit)
+
+
+def _short(path: Path) -> str:
+    """A path as people type it: relative where that is shorter."""
+    try:
+        return str(path.relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)
+
+
+def show(summary: Mapping[str, Any], folder: Path, console: Console) -> None:
+    """Print what came out of a run."""
+    if rows := summary['evaluations']:
+        first = [summary['random']['true_return_mean']] if summary['random'] else []
+        values = first + [row['true_return_mean'] for row in rows]
+        curve = report.sketch(values, console.encoding)
+        begins = 'random policy' if first else f'{rows[0]["step"]} steps'
+        console.print(
+            f'\ntrue return, {begins} to {rows[-1]["step"]} steps: '
+            f'{values[0]:.1f} |{curve}| {values[-1]:.1f}',
+            highlight=False,
+            markup=False,
+        )
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_column(style='dim', no_wrap=True)
+    table.add_column(overflow='fold')
+    for name, text in report.result_rows(summary):
+        table.add_row(name, text)
+    for name, file in (
+        ('report', run_folder.REPORT),
+        ('picture', run_folder.PICTURE),
+        ('summary', run_folder.SUMMARY),
+        ('metrics', run_folder.METRICS),
+    ):
+        table.add_row(name, _short(folder / file))
+    if summary['bag']:
+        table.add_row('bag', _short(Path(summary['bag'])))
+    console.print()
+    console.print(table)
+    if summary['interrupted']:
+        console.print('\ninterrupted: what was done is kept', highlight=False)
+
+
+def say_failure(outcome: Outcome) -> None:
+    """Say on stderr why the run failed, with the end of the log that explains it."""
+    console = Console(stderr=True)
+    console.print(f'\ncodetr: the run failed: {outcome.failure}', style='bold red', markup=False)
+    if outcome.log is not None:
+        console.print(f'the end of {_short(outcome.log)}:', markup=False, highlight=False)
+        console.print(launcher.end_of_log(outcome.log), markup=False, highlight=False)

@@ -1,0 +1,123 @@
+"""Algorithm 1 with plain calls instead of topics: the same cores, in the same order, in one process.
+
+With the same seed, pace and thread count a run over topics ends with the same weights as this one.
+"""
+
+import logging
+import resource
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+
+from codetr_ros import run_folder
+from codetr_ros.config import Settings
+from codetr_ros.evaluation import Evaluator
+from codetr_ros.learners.core import Learner
+from codetr_ros.recorder import Recorder
+from codetr_ros.records import TOPICS, Record
+from codetr_ros.rewards.core import Labeller
+from codetr_ros.simulator import Simulator
+
+_log = logging.getLogger(__name__)
+
+
+class Core(Protocol):
+    """What every part of a run is, whoever wires it: it takes records in, works in slices, gives records out."""
+
+    subscribes: tuple[type, ...]
+    finished: bool
+
+    def receive(self, record: Record) -> None:
+        """Store a record; raises `RecordError` for what must be refused, and has then changed nothing."""
+
+    def work(self) -> Iterator[list[Record] | None]:
+        """One slice for each `next()`: the records that became ready, or None while there is nothing to do."""
+
+    def close(self) -> None:
+        """Save what must outlast the process; harmless when called again."""
+
+    def report(self) -> dict[str, Any]:
+        """What to say in the run's summary."""
+
+
+def run(
+    settings: Settings,
+    run_id: str,
+    folder: Path | None = None,
+    observe: Callable[[Record], None] = lambda record: None,
+) -> dict[str, dict[str, Any]]:
+    """Run Algorithm 1 to its end.
+
+    Args:
+        settings: the run's settings.
+        run_id: its name.
+        folder: where checkpoints and reports go; None keeps none.
+        observe: is handed every record, in order. What it raises ends the run, after a checkpoint.
+
+    Returns:
+        A report for each part of the run, as the nodes write them.
+
+    Raises:
+        RuntimeError: every part waits for another: a fault of this program.
+    """
+    torch.set_num_threads(settings.threads)
+    spec = settings.run_spec(run_id)
+    checkpoints = folder / run_folder.CHECKPOINTS if folder else None
+    cores: dict[str, tuple[str, Core]] = {
+        name: ('sim', Simulator(spec, settings, name)) for name in settings.sources
+    }
+    cores['record'] = ('record', Recorder(spec, settings, 'record'))
+    cores['reward'] = ('reward', Labeller(spec, settings, 'reward', checkpoints))
+    cores['learner'] = ('learner', Learner(spec, settings, 'learner', checkpoints))
+    cores['evaluate'] = ('evaluate', Evaluator(spec, settings, 'evaluate'))
+    published: dict[str, Counter[str]] = {name: Counter() for name in cores}
+    received: dict[str, Counter[str]] = {name: Counter() for name in cores}
+    seconds: Counter[str] = Counter()
+    works = {name: core.work() for name, (_, core) in cores.items()}
+    observe(spec)
+    finished = False
+    try:
+        while not finished:
+            idle = True
+            for name, work in works.items():
+                began = time.perf_counter()
+                records = next(work)
+                seconds[name] += time.perf_counter() - began
+                if records is None:
+                    continue
+                idle = False
+                for record in records:
+                    topic = TOPICS[type(record)]
+                    published[name][topic] += 1
+                    for reader, (_, core) in cores.items():
+                        if type(record) in core.subscribes:
+                            received[reader][topic] += 1
+                            core.receive(record)
+                    observe(record)
+            finished = all(core.finished for _, core in cores.values())
+            if idle and not finished:
+                waiting = [name for name, (_, core) in cores.items() if not core.finished]
+                raise RuntimeError(f'every part of the run waits for another: {", ".join(waiting)} have not finished')
+    finally:
+        reports = {}
+        for name, (role, core) in cores.items():
+            core.close()
+            reports[name] = {
+                'role': role,
+                'name': name,
+                'published': dict(published[name]),
+                'received': dict(received[name]),
+                'refused': {},
+                'peak_rss_mb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+                'cpu_s': seconds[name],
+                'wall_s': seconds[name],
+                'finished': core.finished,
+                'error': None,
+            } | core.report()
+            if folder is not None:
+                run_folder.write_report(folder, role, name, reports[name])
+    return reports

@@ -1,0 +1,244 @@
+"""What flows between the parts of a run: one frozen dataclass for each message of `codetr_msgs`.
+
+A record has the fields of its message, with the same names, in the same order (the message adds a
+`stamp`, which nothing learns from). Records know nothing of ROS; `codetr_ros.ros.messages` turns one into
+the other. Arrays are numpy; their shapes use T = steps, O = observation size, A = action size.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+PROTOCOL_VERSION = 1
+"""Raised whenever a field changes its meaning; nodes of different versions refuse each other."""
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+U32 = NDArray[np.uint32]
+I64 = NDArray[np.int64]
+U64 = NDArray[np.uint64]
+
+ROLES = ('sim', 'evaluate', 'reward', 'learner', 'record')
+INITIAL_VERSION = -1
+"""Policy version of the untrained policy; version k is the policy published after training on phase k."""
+
+
+class RecordError(ValueError):
+    """A record that must not be taken in: the message names value, field, source and remedy."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RunSpec:
+    """What run this is, with every setting that its nodes share. From the learner to all."""
+
+    run_id: str
+    protocol_version: int
+    seed: int
+    settings: str  # canonical JSON of `config.Settings`
+    settings_hash: str  # sha256 of `settings`
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Presence:
+    """A node says that it is there: on start, once a second, and a last time when it has finished.
+
+    `published` counts the records it has published so far on each of `topics`, so that whoever listens can say what
+    is missing. `missed` counts, in the same order, what it was told was published to it but never reached it.
+    """
+
+    run_id: str
+    role: str  # one of ROLES
+    node: str  # fully qualified node name; the source's name where role is 'sim'
+    instance_id: str  # another one after each start of the process
+    settings_hash: str  # empty while the node still waits for the run
+    finished: bool
+    topics: tuple[str, ...]
+    published: U64  # (len(topics),)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TaskSpec:
+    """What a source simulates. From each simulator to all."""
+
+    run_id: str
+    protocol_version: int
+    source: str
+    task: str
+    observation_size: int
+    action_size: int
+    horizon: int  # steps after which an episode is truncated
+    control_period: float  # seconds of simulated time that a step takes
+    r_max: float  # the largest reward of one step, for score normalisation
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Policy:
+    """The permission for one phase, with the policy to act under. From the learner to the simulators.
+
+    Steps that are all zero permit nothing: every phase of the run has been permitted before.
+    """
+
+    run_id: str
+    phase: int
+    version: int  # INITIAL_VERSION or the phase after whose training these weights were published
+    sources: tuple[str, ...]
+    steps: U32  # (len(sources),) steps that each source takes in this phase
+    random: bool  # act uniformly at random; `weights` is then empty
+    network: str  # JSON description of the network the weights belong to
+    weights: bytes  # safetensors
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Transitions:
+    """Consecutive steps of one episode in one phase. From a simulator to recorder, reward and learner."""
+
+    run_id: str
+    source: str
+    sequence: int  # 0, 1, 2, ... for each source
+    phase: int
+    episode: int  # 0, 1, 2, ... for each source
+    first_step: int  # index within the episode of the first of these steps
+    steps: int  # T
+    observations: F32  # (T+1, O): the observation before each step, and the one after the last
+    actions: F32  # (T, A) in [-1, 1]
+    terminated: bool  # the last step ended the episode in a terminal state: nothing is bootstrapped from it
+    truncated: bool  # the last step ended the episode at its horizon
+    phase_end: bool  # these are the source's last steps of the phase
+    scores_due: int  # on phase_end: composite rewards due for segments that ended in this phase
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CompositeReward:
+    """The score of one segment. From whoever scores to recorder, reward, and learners that use it directly."""
+
+    run_id: str
+    source: str  # whose segment it is
+    scorer: str  # who scored it
+    sequence: int  # 0, 1, 2, ... for each scorer
+    episode: int
+    first_step: int
+    length: int
+    value: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Commit:
+    """A phase is on disk, whole: exactly these records belong to it. From the recorder to reward and learner."""
+
+    run_id: str
+    phase: int
+    sources: tuple[str, ...]
+    transitions: I64  # (len(sources),) last sequence number of each source, -1 for none yet
+    scorers: tuple[str, ...]
+    scores: I64  # (len(scorers),) last sequence number of each scorer, -1 for none yet
+    dropped: tuple[str, ...]  # sources left out of the phase: silent beyond the deadline
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class StepRewards:
+    """New and changed labels after a phase: part `part` of `parts`. From the reward node to learner and recorder."""
+
+    run_id: str
+    phase: int
+    version: int  # of the reward model: gradient steps taken
+    part: int
+    parts: int
+    source: str  # empty where the part is empty
+    episodes: U32  # (S,) the segment's episode
+    first_steps: U32  # (S,)
+    lengths: U32  # (S,)
+    labels: F32  # (sum of lengths,) segment after segment
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class EpisodeResult:
+    """How one episode went. From simulators (training) and the evaluator to recorder and people."""
+
+    run_id: str
+    source: str
+    purpose: str  # 'training', 'evaluation' or 'random' (evaluation of the uniformly random policy)
+    step: int  # training steps that the policy has learnt from (evaluation), or taken so far (training)
+    version: int  # policy version
+    episode: int
+    length: int
+    true_return: float
+    composite_return: float
+    score: float  # composite return / that of an agent that earns r_max at every step of the horizon
+    terminated: bool
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TrueRewards:
+    """The environment's own step rewards, for evaluation only: never for the learner or the reward node."""
+
+    run_id: str
+    source: str
+    sequence: int  # that of the Transitions it belongs to
+    phase: int
+    episode: int
+    first_step: int
+    rewards: F32  # (T,)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Metrics:
+    """Named numbers at a step. From every node to recorder and people."""
+
+    run_id: str
+    role: str
+    node: str
+    phase: int
+    step: int  # training steps taken in the run up to here
+    names: tuple[str, ...]
+    values: F64  # (len(names),)
+
+
+Record = (
+    RunSpec
+    | Presence
+    | TaskSpec
+    | Policy
+    | Transitions
+    | CompositeReward
+    | Commit
+    | StepRewards
+    | EpisodeResult
+    | TrueRewards
+    | Metrics
+)
+
+TOPICS: dict[type, str] = {
+    RunSpec: 'run',
+    Presence: 'presence',
+    TaskSpec: 'task',
+    Policy: 'policy',
+    Transitions: 'transitions',
+    CompositeReward: 'composite_rewards',
+    Commit: 'commits',
+    StepRewards: 'step_rewards',
+    EpisodeResult: 'episodes',
+    TrueRewards: 'true_rewards',
+    Metrics: 'metrics',
+}
+"""The (relative) name of the topic that carries each kind of record."""
+
+
+def metrics(
+    run_id: str, role: str, node: str, phase: int, step: int, values: Mapping[str, float]
+) -> Metrics:
+    """A `Metrics` record from names and values."""
+    numbers = np.array(list(values.values()), np.float64)
+    return Metrics(run_id, role, node, phase, step, tuple(values), numbers)
+
+
+def describe(record: Record) -> str:
+    """Name a record briefly, for errors: its kind and its scalar fields, no arrays."""
+    shown = []
+    for f in fields(record):
+        value: Any = getattr(record, f.name)
+        if f.name != 'run_id' and isinstance(value, (bool, int, float)) or f.name in ('source', 'node'):
+            shown.append(f'{f.name}={value}')
+    return f'{type(record).__name__}({", ".join(shown)})'

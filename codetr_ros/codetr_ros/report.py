@@ -1,0 +1,203 @@
+"""The report of a run for people: a picture of the learning curve and one HTML page."""
+
+import base64
+import html
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from codetr_ros import run_folder
+
+_TRUE, _SCORE = '#1f5fa8', '#b8561c'
+_STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem;
+color: #222 } h1 { font-size: 1.4rem } h2 { font-size: 1.1rem; margin-top: 2rem } table { border-
+collapse: collapse } td, th { padding: .15rem .8rem .15rem 0; text-align: right; border-bottom: 1px
+solid #ddd } td:first-child, th:first-child { text-align: left } th { font-weight: 600 } img { max-
+width: 100% } .bad { color: #b00020; font-weight: 600 } code { font-size: .9em; overflow-wrap:
+anywhere }
+"""
+
+
+def title(summary: Mapping[str, Any]) -> str:
+    """What run it was, in a line."""
+    said = '{task}, {composite} of {delay} steps, {method}, seed {seed}'.format(**summary)
+    return said + (' (interrupted)' if summary['interrupted'] else '')
+
+
+def draw(summary: Mapping[str, Any]) -> bytes:
+    """The learning curve as a PNG: true return and score of each evaluation against steps.
+
+    The band goes from the worst to the best episode of an evaluation; the dashed line is the
+    random policy.
+    """
+    # Without pyplot: no display, no state that outlives the picture, and half the import time.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    rows = summary['evaluations']
+    figure = Figure(figsize=(8, 4.5), dpi=120, layout='constrained')
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    axes.set_title(title(summary), fontsize=11)
+    axes.set_xlabel('environment steps')
+    axes.set_ylabel('true return of an episode', color=_TRUE)
+    axes.grid(alpha=0.3)
+    right = axes.twinx()
+    right.set_ylabel('score (composite return / perfect)', color=_SCORE)
+    if rows:
+        steps = [row['step'] for row in rows]
+        axes.fill_between(
+            steps,
+            [row['true_return_min'] for row in rows],
+            [row['true_return_max'] for row in rows],
+            color=_TRUE,
+            alpha=0.15,
+            linewidth=0,
+            label='worst to best episode',
+        )
+        true = [row['true_return_mean'] for row in rows]
+        axes.plot(steps, true, 'o-', color=_TRUE, markersize=4, label='true return, mean')
+        score = [row['score_mean'] for row in rows]
+        right.plot(steps, score, 's:', color=_SCORE, markersize=3, label='score, mean')
+    else:
+        axes.text(0.5, 0.5, 'no evaluation', transform=axes.transAxes, ha='center')
+    if summary['random']:
+        mean = summary['random']['true_return_mean']
+        axes.axhline(mean, color='#555', linestyle='--', linewidth=1, label='random policy')
+    axes.set_xlim(0, summary['steps_planned'])
+    handles, labels = axes.get_legend_handles_labels()
+    more, names = right.get_legend_handles_labels()
+    if handles or more:
+        axes.legend(handles + more, labels + names, loc='best', fontsize=8, framealpha=0.8)
+    picture = io.BytesIO()
+    figure.savefig(picture, format='png')
+    return picture.getvalue()
+
+
+def page(summary: Mapping[str, Any], picture: bytes) -> str:
+    """The HTML page, with everything in it."""
+    shown = base64.b64encode(picture).decode()
+    parts = [
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">',
+        f'<title>{_text(title(summary))}</title><style>{_STYLE}</style></head><body>',
+        f'<h1>{_text(title(summary))}</h1>',
+        f'<p class="bad">{_text(summary["failure"])}</p>' if summary['failure'] else '',
+        f'<img alt="learning curve" src="data:image/png;base64,{shown}">',
+        '<h2>Result</h2>',
+        _table(['', ''], [[name, value] for name, value in result_rows(summary)]),
+        '<p>The score is the composite return of an episode over that of an agent that earns the '
+        "task's largest reward at every step.</p>",
+        '<h2>Evaluations</h2>',
+        _records(([summary['random']] if summary['random'] else []) + summary['evaluations']),
+        '<h2>Messages</h2>',
+        _messages(summary['messages']),
+        '<h2>Processes</h2>',
+        _records([{'process': name, **row} for name, row in summary['processes'].items()]),
+        '<h2>Settings</h2>',
+        _table(['setting', 'value'], list(_flat(summary['settings']))),
+        '<h2>Identity</h2>',
+        _table(
+            ['', ''],
+            [
+                [name, summary[name]]
+                for name in ('run_id', 'policy_sha256', 'reward_model_sha256', 'settings_hash')
+            ]
+            + [[f'version of {name}', value] for name, value in summary['versions'].items()],
+        ),
+        '</body></html>\n',
+    ]
+    return '\n'.join(part for part in parts if part)
+
+
+def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The few numbers that people look for first, for the page and for the terminal."""
+
+    def number(value: float | None, form: str) -> str:
+        return 'not evaluated' if value is None else format(value, form)
+
+    last = summary['evaluations'][-1] if summary['evaluations'] else None
+    spread = f' +- {last["true_return_std"]:.1f}' if last else ''
+    after = f' after {last["step"]} steps' if last else ''
+    return [
+        ('score', f'{number(summary["final_score"], ".3f")}{after}'),
+        ('score of the random policy', number(summary['random_score'], '.3f')),
+        ('true return', f'{number(summary["final_true_return"], ".1f")}{spread}'),
+        ('true return of the random policy', number(summary['random_true_return'], '.1f')),
+        ('steps', f'{summary["steps"]} of {summary["steps_planned"]}'),
+        ('phases', f'{summary["phases"]} of {summary["phases_planned"]}'),
+        ('time', f'{summary["wall_s"]:.1f} s, {summary["steps_per_s"] or 0:.0f} steps per second'),
+        (
+            'messages',
+            f'{sum(row["published"] for row in summary["messages"].values())} published, '
+            + ', '.join(
+                f'{summary[fault]} {fault}' for fault in ('lost', 'duplicated', 'refused')
+            ),
+        ),
+    ]
+
+
+_BARS = ' ▁▂▃▄▅▆▇█'
+
+
+def sketch(values: Sequence[float], encoding: str | None) -> str:
+    """A learning curve in a line of text: one bar for each value, the highest full."""
+    bars = _BARS
+    try:
+        bars.encode(encoding or 'ascii')
+    except (UnicodeEncodeError, LookupError):
+        bars = ' .:-=+*#@'
+    low, high = min(values), max(values)
+    top = len(bars) - 1
+    if high == low:
+        return bars[1] * len(values)
+    return ''.join(bars[1 + round((v - low) / (high - low) * (top - 1))] for v in values)
+
+
+def write(folder: Path, summary: Mapping[str, Any]) -> None:
+    """Write the picture and the page into a run's folder."""
+    picture = draw(summary)
+    run_folder.atomic_write(folder / run_folder.PICTURE, picture)
+    run_folder.atomic_write(folder / run_folder.REPORT, page(summary, picture))
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return ''
+    if isinstance(value, float):
+        return f'{value:.6g}'
+    return html.escape(
+        ', '.join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
+    )
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    head = ''.join(f'<th>{_text(name)}</th>' for name in header)
+    body = ''.join(
+        '<tr>' + ''.join(f'<td>{_text(cell)}</td>' for cell in row) + '</tr>\n' for row in rows
+    )
+    return f'<table>{f"<tr>{head}</tr>" if any(header) else ""}\n{body}</table>'
+
+
+def _records(rows: Sequence[Mapping[str, Any]]) -> str:
+    if not rows:
+        return '<p>none</p>'
+    names = list(rows[0])
+    return _table(
+        [n.replace('_', ' ') for n in names], [[row.get(n) for n in names] for row in rows]
+    )
+
+
+def _messages(messages: Mapping[str, Mapping[str, int]]) -> str:
+    return _records([{'topic': topic, **row} for topic, row in messages.items()])
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = '') -> list[list[Any]]:
+    found: list[list[Any]] = []
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            found += _flat(value, f'{prefix}{name}.')
+        else:
+            found.append([prefix + name, value])
+    return found

@@ -1,0 +1,32 @@
+"""Reward methods: from composite rewards to step rewards, each behind the same small protocol."""
+
+from codetr_ros.config import Settings
+from codetr_ros.rewards.codetr import Codetr
+from codetr_ros.rewards.method import RewardMethod, RewardModelError, segment_steps
+from codetr_ros.rewards.redistribution import LastStep, Ones, TrueReward, Uniform
+
+__all__ = ['METHODS', 'RewardMethod', 'RewardModelError', 'make', 'segment_steps']
+
+METHODS: dict[str, type[Codetr | LastStep | Uniform | TrueReward | Ones]] = {
+    method.name: method for method in (Codetr, LastStep, Uniform, TrueReward, Ones)
+}
+"""Reward methods by the name that `settings.method` gives them."""
+
+
+def make(settings: Settings, observation_size: int, action_size: int) -> RewardMethod:
+    """Make the reward method that the settings name.
+
+    Args:
+        settings: the run's settings.
+        observation_size: O of the task.
+        action_size: A of the task.
+
+    Raises:
+        RewardModelError: there is no such method.
+    """
+    if settings.method not in METHODS:
+        raise RewardModelError(
+            f'method = {settings.method!r}: there is no such reward method; '
+            f'choose one of {", ".join(METHODS)}'
+        )
+    return METHODS[settings.method](settings, observation_size, action_size)

@@ -1,0 +1,255 @@
+"""The reward node's part of Algorithm 1: take a phase in, fit the reward model, label, say what changed."""
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codetr_ros import checkpoints, records, rewards
+from codetr_ros.config import Settings
+from codetr_ros.intake import Intake
+from codetr_ros.records import (
+    F32,
+    I64,
+    Commit,
+    CompositeReward,
+    Record,
+    RunSpec,
+    StepRewards,
+    TaskSpec,
+    Transitions,
+    TrueRewards,
+)
+from codetr_ros.rewards.method import segment_steps
+from codetr_ros.seeding import generator, seed_torch
+from codetr_ros.trajectories import Trajectories
+
+PART_BYTES = 200_000
+"""Upper bound of a part's arrays: well inside the 512 KB segment of Fast DDS' shared memory."""
+
+
+class Labeller:
+    """Infers step rewards from composite rewards, phase by phase.
+
+    Args:
+        run: the run.
+        settings: its settings.
+        name: node name.
+        folder: where checkpoints go; None keeps none.
+    """
+
+    subscribes: tuple[type, ...] = (TaskSpec, Transitions, CompositeReward, Commit)
+
+    def __init__(self, run: RunSpec, settings: Settings, name: str, folder: Path | None) -> None:
+        self._run = run
+        self._settings = settings
+        self._name = name
+        self._folder = folder
+        self._oracle = settings.method == 'true'
+        if self._oracle:
+            self.subscribes = (*self.subscribes, TrueRewards)
+        self._intake = Intake(run, settings, scores=True, true_rewards=self._oracle)
+        self._method: rewards.RewardMethod | None = None
+        self._memory: Trajectories | None = None
+        self._labelled_version = -1
+        self._labelled = np.empty(0, np.int64)  # ids that have their first label
+        self._phase = 0
+        self._saved = -1
+        self._counters: Counter[str] = Counter()
+        self.finished = False
+
+    @property
+    def missing(self) -> int | None:
+        """A committed phase of which something has not arrived."""
+        return self._intake.missing
+
+    def receive(self, record: Record) -> None:
+        """Hold a record until its phase's turn.
+
+        Raises:
+            RecordError: it must not be taken in; nothing has changed.
+        """
+        self._intake.receive(record)
+
+    def work(self) -> Iterator[list[Record] | None]:
+        """Algorithm 1 as this node sees it; one slice per `next()`."""
+        settings = self._settings
+        while not self._intake.tasks.known:
+            yield None
+        spec = self._intake.tasks.first
+        memory = Trajectories(
+            spec.observation_size,
+            spec.action_size,
+            settings.delay,
+            settings.memory_steps,
+            settings.phase_steps + spec.horizon,
+            self._oracle,
+        )
+        method = rewards.make(settings, spec.observation_size, spec.action_size)
+        self._memory, self._method = memory, method
+        for phase in range(settings.phases):
+            while not self._intake.take(phase, memory):
+                yield None
+            if phase < settings.warmup_phases - 1:
+                self._phase = phase + 1
+                continue
+            if phase == settings.warmup_phases - 1:
+                method.prepare(memory)
+            metrics: dict[str, float] = {}
+            for metrics in self._fit(phase, memory, method):
+                yield []
+            began = time.perf_counter()
+            parts: list[StepRewards] = []
+            for batch in self._label(phase, memory, method):
+                parts += batch
+                yield []
+            metrics |= {
+                'target_scale': method.target_scale,
+                'gradient_steps': method.version,
+                'label_seconds': time.perf_counter() - began,
+            }
+            self._phase = phase + 1
+            step = settings.steps_after(phase)
+            yield [
+                *self._numbered(phase, method.version, parts),
+                records.metrics(self._run.run_id, 'reward', self._name, phase, step, metrics),
+            ]
+            self.close()
+            yield []
+        self.finished = True
+        while True:
+            yield None
+
+    def _fit(
+        self, phase: int, memory: Trajectories, method: rewards.RewardMethod
+    ) -> Iterator[dict[str, float]]:
+        codetr = self._settings.codetr
+        first = phase == self._settings.warmup_phases - 1 or method.version == 0
+        steps = 0
+        if not method.frozen:
+            steps = codetr.first_gradient_steps if first else codetr.gradient_steps
+        if steps and not len(memory.segment_ids()):
+            self._counters['gradient steps skipped, nothing scored'] += steps
+            return
+        began = time.perf_counter()
+        sums: Counter[str] = Counter()
+        for i in range(steps):
+            # a stream of its own: neither interleaving nor a restart changes what it draws
+            seed_torch(self._settings.seed, 'reward', phase, i)
+            rng = generator(self._settings.seed, 'reward', phase, i)
+            sums.update(method.gradient_step(memory, rng))
+            yield {}
+        if steps:
+            means = {name: float(value) / steps for name, value in sums.items()}
+            yield means | {'fit_seconds': time.perf_counter() - began}
+
+    def _label(
+        self, phase: int, memory: Trajectories, method: rewards.RewardMethod
+    ) -> Iterator[list[StepRewards]]:
+        ids = memory.segment_ids()
+        fresh = np.setdiff1d(ids, self._labelled, assume_unique=True)
+        todo = fresh if method.frozen or method.version == self._labelled_version else ids
+        for i in range(0, len(todo), self._settings.codetr.label_batch):
+            some = todo[i : i + self._settings.codetr.label_batch]
+            labels = self._labels(memory, method, some)
+            yield self._records(phase, memory, some, labels, method.version)
+        self._labelled, self._labelled_version = ids, method.version
+
+    def _labels(self, memory: Trajectories, method: rewards.RewardMethod, ids: I64) -> F32:
+        """Labels of segments, one after the other: (sum of lengths,)."""
+        codetr = self._settings.codetr
+        if codetr.labelling == 'window' and not method.frozen:
+            batches = memory.windows(ids, codetr.window, codetr.label_batch)
+            return np.concatenate([method.label_windows(batch) for batch in batches])
+        batch = memory.segment_batch(ids, method.context)
+        return method.label(batch)[segment_steps(batch)]
+
+    def _records(
+        self, phase: int, memory: Trajectories, ids: I64, labels: F32, version: int
+    ) -> list[StepRewards]:
+        found = []
+        at = 0
+        for source, episodes, firsts, lengths in memory.segments(ids):  # ids are ordered by source
+            while len(lengths):
+                fit = int(np.searchsorted(np.cumsum(lengths * 4 + 12), PART_BYTES, side='right'))
+                n = max(1, fit)
+                steps = int(lengths[:n].sum())
+                arrays = [a[:n].astype(np.uint32) for a in (episodes, firsts, lengths)]
+                part = labels[at : at + steps].copy()
+                found.append(
+                    StepRewards(self._run.run_id, phase, version, 0, 0, source, *arrays, part)
+                )
+                at += steps
+                episodes, firsts, lengths = episodes[n:], firsts[n:], lengths[n:]
+        return found
+
+    def _numbered(self, phase: int, version: int, found: list[StepRewards]) -> list[StepRewards]:
+        """Join small batches into parts as large as may be, and number them; at least one, if empty."""
+        parts: list[list[StepRewards]] = []
+        size = PART_BYTES
+        for piece in found:
+            weight = len(piece.labels) * 4 + len(piece.lengths) * 12
+            if size + weight > PART_BYTES or parts[-1][0].source != piece.source:
+                parts.append([])
+                size = 0
+            parts[-1].append(piece)
+            size += weight
+        if not parts:
+            empty = np.empty(0, np.uint32)
+            nothing = np.empty(0, np.float32)
+            none = StepRewards(
+                self._run.run_id, phase, version, 0, 1, '', empty, empty, empty, nothing
+            )
+            return [none]
+        return [
+            StepRewards(
+                self._run.run_id,
+                phase,
+                version,
+                i,
+                len(parts),
+                pieces[0].source,
+                np.concatenate([p.episodes for p in pieces]),
+                np.concatenate([p.first_steps for p in pieces]),
+                np.concatenate([p.lengths for p in pieces]),
+                np.concatenate([p.labels for p in pieces]),
+            )
+            for i, pieces in enumerate(parts)
+        ]
+
+    def close(self) -> None:
+        """Save a checkpoint of the last finished phase, if there is a folder and none was saved."""
+        done = self._phase - 1
+        if self._folder is None or self._method is None or self._saved == done:
+            return
+        if done < self._settings.warmup_phases - 1:
+            return
+        spec = self._intake.tasks.first
+        meta = {
+            'run_id': self._run.run_id,
+            'settings': self._run.settings,
+            'task': spec.task,
+            'observation_size': spec.observation_size,
+            'action_size': spec.action_size,
+            'phase': done,
+            'gradient_steps': self._method.version,
+        }
+        checkpoints.save(self._folder, 'reward', done, self._method.state(), meta)
+        self._saved = done
+
+    def report(self) -> dict[str, Any]:
+        """Counts and digests for the run's summary."""
+        said: dict[str, Any] = {
+            'duplicated': dict(self._intake.duplicated),
+            'refused': dict(self._intake.refused),
+            'counters': dict(self._counters),
+        }
+        if self._method is not None:
+            said['gradient_steps'] = self._method.version
+            said['reward_model_sha256'] = checkpoints.digest(self._method.state())
+        if self._memory is not None:
+            said['memory'] = self._memory.report()
+        return said

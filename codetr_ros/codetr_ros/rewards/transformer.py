@@ -1,0 +1,168 @@
+"""The reward transformer: a causal transformer over steps, then attention within the sequence.
+
+    R(segment) = sum_t w_t(segment) rhat_t(prefix up to t)        (the paper's Eq. 4)
+
+rhat_t is linear in the causal state of step t, which has seen (s_1, a_1, ..., s_t, a_t) (Eq. 5).
+w_t is how much all steps of the sequence attend to step t: the t-th column sum of a bidirectional
+softmax attention (Eqs. 6 and 7), so that the weights of m steps sum to m.
+
+Shapes: B = batch, L = steps of the longest window, N = tokens (2 L or L), H = heads, d = the
+embedding's, O and A = observation and action size. Windows are padded on the right: a causal token
+never sees the padding behind it, and the attention within the sequence is masked.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from codetr_ros.config import CodetrSettings
+
+
+class CausalSelfAttention(nn.Module):
+    """Multi-head attention of each token to itself and those before it."""
+
+    def __init__(self, settings: CodetrSettings) -> None:
+        super().__init__()
+        d = settings.embedding
+        self.heads = settings.heads
+        self.dropout = settings.dropout
+        self.qkv = nn.Linear(d, 3 * d)
+        self.out = nn.Linear(d, d)
+
+    def forward(self, h: Tensor) -> Tensor:
+        b, n, d = h.shape
+        qkv = self.qkv(h).view(b, n, 3, self.heads, d // self.heads)  # (B, N, 3, H, d/H)
+        q, k, v = qkv.permute(2, 0, 3, 1, 4)  # each (B, H, N, d/H)
+        p = self.dropout if self.training else 0.0
+        y = F.scaled_dot_product_attention(q, k, v, dropout_p=p, is_causal=True)  # (B, H, N, d/H)
+        mixed: Tensor = self.out(y.transpose(1, 2).reshape(b, n, d))  # (B, N, d)
+        return mixed
+
+
+class Block(nn.Module):
+    """Pre-norm transformer layer: attention, then an MLP four times as wide."""
+
+    def __init__(self, settings: CodetrSettings) -> None:
+        super().__init__()
+        d = settings.embedding
+        self.norm1 = nn.LayerNorm(d)
+        self.attention = CausalSelfAttention(settings)
+        self.norm2 = nn.LayerNorm(d)
+        self.mlp = nn.Sequential(nn.Linear(d, 4 * d), nn.ReLU(), nn.Linear(4 * d, d))
+        self.dropout = nn.Dropout(settings.dropout)
+
+    def forward(self, h: Tensor) -> Tensor:
+        h = h + self.dropout(self.attention(self.norm1(h)))  # (B, N, d)
+        h = h + self.dropout(self.mlp(self.norm2(h)))  # (B, N, d)
+        return h
+
+
+class CausalTransformer(nn.Module):
+    """Steps to their causal states: x_t has seen what happened up to step t, nothing after it.
+
+    Tokens are `pair` (s_1, a_1, s_2, a_2, ...), read at the action, or `merged`, one for each
+    step. A step's position is its place in the window, whatever its time in the episode.
+    """
+
+    def __init__(
+        self, observation_size: int, action_size: int, positions: int, settings: CodetrSettings
+    ) -> None:
+        super().__init__()
+        d = settings.embedding
+        self.pair = settings.tokens == 'pair'
+        self.observation = nn.Linear(observation_size, d)
+        self.action = nn.Linear(action_size, d)
+        self.position = nn.Embedding(positions, d)
+        self.norm_in = nn.LayerNorm(d)
+        self.dropout = nn.Dropout(settings.dropout)
+        self.blocks = nn.Sequential(*(Block(settings) for _ in range(settings.layers)))
+        self.norm_out = nn.LayerNorm(d)
+
+    def forward(self, observations: Tensor, actions: Tensor) -> Tensor:
+        s = self.observation(observations)  # (B, L, d)
+        a = self.action(actions)  # (B, L, d)
+        position = self.position.weight[: s.shape[1]]  # (L, d)
+        if self.pair:
+            tokens = torch.stack([s + position, a + position], 2).flatten(1, 2)  # (B, 2L, d)
+        else:
+            tokens = s + a + position  # (B, L, d)
+        h = self.blocks(self.dropout(self.norm_in(tokens)))  # (B, N, d)
+        x: Tensor = self.norm_out(h[:, 1::2] if self.pair else h)  # (B, L, d)
+        return x
+
+
+class SequenceWeights(nn.Module):
+    """w_t: how much the steps of the sequence attend to step t, all of them together."""
+
+    def __init__(self, settings: CodetrSettings) -> None:
+        super().__init__()
+        d = settings.embedding
+        self.qk = nn.Linear(d, 2 * d)
+        self.scale = 1 / math.sqrt(d) if settings.head_scale == 'inverse_sqrt' else 1.0
+
+    def attention(self, x: Tensor, inside: Tensor) -> Tensor:
+        """Softmax attention (B, L, L) among the steps `inside` (B, L); rows of others are 0."""
+        q, k = self.qk(x).chunk(2, -1)  # each (B, L, d)
+        unseen = torch.zeros(inside.shape).masked_fill_(~inside, -math.inf)  # (B, L)
+        logits = self.scale * (q @ k.transpose(1, 2)) + unseen[:, None, :]  # (B, L, L)
+        found: Tensor = logits.softmax(-1) * inside[:, :, None]  # (B, L, L)
+        return found
+
+    def forward(self, x: Tensor, inside: Tensor) -> Tensor:
+        return self.attention(x, inside).sum(1)  # (B, L), the column sums
+
+
+class UnitWeights(nn.Module):
+    """w_t = 1: the ablation, a plain sum of causal step rewards."""
+
+    def forward(self, x: Tensor, inside: Tensor) -> Tensor:
+        return inside.to(x.dtype)  # (B, L)
+
+
+class RewardTransformer(nn.Module):
+    """Steps of a window to their weights w and rewards rhat.
+
+    Args:
+        observation_size: O.
+        action_size: A.
+        positions: steps of the longest window that will ever come.
+        settings: architecture and dropout.
+    """
+
+    def __init__(
+        self, observation_size: int, action_size: int, positions: int, settings: CodetrSettings
+    ) -> None:
+        super().__init__()
+        self.causal = CausalTransformer(observation_size, action_size, positions, settings)
+        attentive = settings.weights == 'attention'
+        self.weights = SequenceWeights(settings) if attentive else UnitWeights()
+        self.reward = nn.Linear(settings.embedding, 1)
+        self.apply(_initialise)
+
+    def forward(
+        self, observations: Tensor, actions: Tensor, inside: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Weights and rewards of every step.
+
+        Args:
+            observations: (B, L, O) before each step.
+            actions: (B, L, A).
+            inside: (B, L) bool, the steps that attend to each other; at least one in each row.
+
+        Returns:
+            w (B, L), 0 outside, and rhat (B, L), of no meaning in the padding.
+        """
+        x = self.causal(observations, actions)  # (B, L, d)
+        return self.weights(x, inside), self.reward(x).squeeze(-1)
+
+
+def _initialise(module: nn.Module) -> None:
+    # Normal with variance 1/inputs, zero biases: the defaults of the Flax modules that the paper
+    # builds on. Torch's own embeddings, of variance 1, would drown observations and actions.
+    if isinstance(module, nn.Linear):
+        nn.init.normal_(module.weight, std=1 / math.sqrt(module.in_features))
+        nn.init.zeros_(module.bias)
+    elif isinstance(module, nn.Embedding):
+        nn.init.normal_(module.weight, std=1 / math.sqrt(module.embedding_dim))

@@ -1,0 +1,177 @@
+"""Episodes, step by step: cut into segments and scored as they go.
+
+Simulators and the evaluator share this code, so that a score means the same in both.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from codetr_ros.composite import composite, perfect_score
+from codetr_ros.config import Settings
+from codetr_ros.intake import check_run
+from codetr_ros.learners.network import ActingPolicy, NetworkError
+from codetr_ros.records import (
+    F32,
+    INITIAL_VERSION,
+    EpisodeResult,
+    Policy,
+    Record,
+    RecordError,
+    RunSpec,
+    describe,
+)
+from codetr_ros.tasks import Environment, check, r_max
+
+
+@dataclass(frozen=True)
+class Score:
+    """The composite reward of the `length` steps that begin at `first_step` of their episode."""
+
+    first_step: int
+    length: int
+    value: float
+
+
+class Episode:
+    """One episode after another of an environment, each cut into segments from its start.
+
+    An episode ends in a terminal state (`terminated`) or at the horizon (`truncated`); one that
+    reaches a terminal state with its last step at the horizon is terminated only. Its last segment
+    may be shorter and is scored too.
+
+    Args:
+        environment: the environment; this object steps it and nothing else may.
+        settings: composite, beta, delay and r_max.
+
+    Raises:
+        SettingsError: the delay exceeds the horizon.
+    """
+
+    def __init__(self, environment: Environment, settings: Settings) -> None:
+        check(settings, environment)
+        self._environment = environment
+        self._settings = settings
+        self._perfect = perfect_score(
+            settings.composite,
+            settings.beta,
+            settings.delay,
+            environment.horizon,
+            r_max(settings, environment),
+        )
+        self._rewards = np.zeros(environment.horizon, np.float64)
+        self.terminated = False
+        self.truncated = True  # nothing runs yet: begin with `reset`
+        self.observation: F32 = np.zeros(environment.observation_size, np.float32)
+        self.length = 0
+        self._first_step = 0  # of the segment that runs
+        self._composite_return = 0.0
+
+    @property
+    def over(self) -> bool:
+        """Whether the episode has ended, so that `reset` is due."""
+        return self.terminated or self.truncated
+
+    def reset(self, seed: int) -> None:
+        """Start another episode from the start that `seed` stands for."""
+        self.observation = self._environment.reset(seed)
+        self.terminated = self.truncated = False
+        self.length = self._first_step = 0
+        self._composite_return = 0.0
+
+    def step(self, action: F32) -> tuple[float, Score | None]:
+        """Take an action (A,) in [-1, 1].
+
+        Returns:
+            The environment's reward, and the score of the segment that the step completed or cut
+            short, if any.
+
+        Raises:
+            TaskError: the environment gave something that is not finite.
+            CompositeError: the segment's composite reward is not finite.
+        """
+        self.observation, reward, self.terminated = self._environment.step(action)
+        self._rewards[self.length] = reward
+        self.length += 1
+        self.truncated = self.length == self._environment.horizon and not self.terminated
+        first, length = self._first_step, self.length - self._first_step
+        settings = self._settings
+        if length < settings.delay and not self.over:
+            return reward, None
+        segment = self._rewards[first : self.length]
+        score = Score(
+            first, length, composite(settings.composite, segment, settings.beta, settings.delay)
+        )
+        self._first_step = self.length
+        self._composite_return += score.value
+        return reward, score
+
+    def result(
+        self, run_id: str, source: str, purpose: str, step: int, version: int, episode: int
+    ) -> EpisodeResult:
+        """How the episode went. `source` to `episode` are the fields of the record."""
+        return EpisodeResult(
+            run_id,
+            source,
+            purpose,
+            step,
+            version,
+            episode,
+            self.length,
+            float(self._rewards[: self.length].sum()),
+            self._composite_return,
+            self._composite_return / self._perfect,
+            self.terminated,
+        )
+
+
+def check_policy(policy: Record, run: RunSpec, settings: Settings, receiver: str) -> Policy:
+    """Refuse what is not a policy of this run.
+
+    Raises:
+        RecordError: another kind of record, another run, steps that do not match the sources, a
+            phase or version that the run does not have.
+    """
+    if not isinstance(policy, Policy):
+        raise RecordError(
+            f'{receiver} takes policies only, not {describe(policy)}: remove this subscription'
+        )
+    check_run(policy, run)
+    if len(policy.steps) != len(policy.sources):
+        raise RecordError(
+            f'{describe(policy)}: steps has {len(policy.steps)} entries for '
+            f'{len(policy.sources)} sources ({", ".join(policy.sources)}): the learner must give '
+            'each source its steps'
+        )
+    last = settings.phases - 1
+    if not (
+        0 <= policy.phase <= last + settings.lag and INITIAL_VERSION <= policy.version <= last
+    ):
+        raise RecordError(
+            f'{describe(policy)}: this run has phase 0 to {last + settings.lag} and version '
+            f'{INITIAL_VERSION} to {last}: the learner must number them so'
+        )
+    return policy
+
+
+def acting_policy(policy: Policy, environment: Environment) -> ActingPolicy | None:
+    """The policy to act with in an environment; None for the uniformly random one.
+
+    Raises:
+        RecordError: the weights are of another architecture, missing or not finite.
+    """
+    if policy.random:
+        return None
+    try:
+        return ActingPolicy.from_record(
+            policy, environment.observation_size, environment.action_size
+        )
+    except NetworkError as error:
+        raise RecordError(
+            f'{describe(policy)} cannot act in task {environment.name!r}: {error}'
+        ) from error
+
+
+def uniform_actions(rng: np.random.Generator, steps: int, size: int) -> F32:
+    """Actions (steps, size), each number uniform in [-1, 1)."""
+    return rng.random((steps, size), dtype=np.float32) * 2 - 1

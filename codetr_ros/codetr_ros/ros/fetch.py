@@ -1,0 +1,96 @@
+"""Fetches a committed phase again from the recorder, for a node that has not got all of it."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from codetr_msgs.srv import FetchPhase
+from rclpy.serialization import deserialize_message
+
+from codetr_ros.records import Record, RecordError
+from codetr_ros.ros import messages
+from codetr_ros.ros.link import Link
+
+SERVICE = 'fetch_phase'
+AFTER = 3.0  # [s] for what is still under way
+AGAIN = 5.0  # [s] until the next try
+
+
+def unpack(response: Any) -> list[Record]:
+    """The records of a response.
+
+    Raises:
+        RecordError: lengths that disagree, or a type that is no record.
+    """
+    lengths = list(response.lengths)
+    if len(lengths) != len(response.types) or sum(lengths) != len(response.cdr):
+        raise RecordError(
+            f'{SERVICE}: {len(response.types)} types, {len(lengths)} lengths of {sum(lengths)} bytes and '
+            f'{len(response.cdr)} bytes disagree: update the recorder'
+        )
+    data = bytes(response.cdr)
+    found = []
+    ends = np.cumsum(lengths, dtype=np.int64)
+    for kind, length, end in zip(response.types, lengths, ends.tolist(), strict=True):
+        if kind not in messages.RECORD_TYPES:
+            raise RecordError(f'{SERVICE}: {kind!r} is not a type of record: update the recorder')
+        message_type = messages.message_type(messages.RECORD_TYPES[kind])
+        found.append(messages.from_message(deserialize_message(data[end - length : end], message_type)))
+    return found
+
+
+class Fetcher:
+    """Asks the recorder when a phase stays incomplete.
+
+    Args:
+        link: the node's connection.
+        run_id: the run.
+        receive: takes each record that comes.
+    """
+
+    def __init__(self, link: Link, run_id: str, receive: Callable[[Record], None]) -> None:
+        self._link = link
+        self._run_id = run_id
+        self._receive = receive
+        self._client = link.node.create_client(FetchPhase, SERVICE)
+        self._missing: int | None = None
+        self._due = 0.0
+        self.fetched = 0
+
+    def check(self, missing: int | None) -> None:
+        """Ask for a phase that has been incomplete for a while.
+
+        Args:
+            missing: the committed phase that is not whole, None if there is none.
+        """
+        now = time.monotonic()
+        if missing != self._missing:
+            self._missing, self._due = missing, now + AFTER
+        if missing is None or now < self._due:
+            return
+        self._due = now + AGAIN
+        log = self._link.node.get_logger()
+        if not self._client.service_is_ready():
+            log.warning(f'phase {missing} is incomplete, and no recorder offers {self._client.srv_name!r}')
+            return
+        log.warning(f'phase {missing} is incomplete: asking the recorder for it')
+        request = FetchPhase.Request(run_id=self._run_id, phase=missing, requester=self._link.full_name)
+        future = self._client.call_async(request)
+        future.add_done_callback(lambda done: self._link.store(self._arrived, missing, done))
+
+    def _arrived(self, phase: int, done: Any) -> None:
+        response = done.result()
+        log = self._link.node.get_logger()
+        if not response.found:
+            log.error(f'the recorder does not send phase {phase} again: {response.reason}')
+            return
+        try:
+            records = unpack(response)
+        except RecordError as error:
+            log.error(str(error))
+            return
+        for record in records:
+            self._receive(record)
+        self.fetched += len(records)
+        log.info(f'phase {phase}: {len(records)} messages came again')

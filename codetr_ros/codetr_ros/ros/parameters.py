@@ -1,0 +1,256 @@
+"""Every setting of the run as a ROS parameter, with description and range, from the one configuration.
+
+The learner makes the run's settings from its parameters. All other nodes take them from the run, refuse a
+parameter that contradicts it, and then show the run's settings as read-only parameters, so that
+`ros2 param list|describe|get` answers alike at every node.
+"""
+
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
+from pydantic import BaseModel
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from codetr_ros.config import Settings, SettingsError, load
+
+Type = Parameter.Type
+NOT_GIVEN = 0.0
+"""What stands for 'not given' where a setting may be None: a ROS parameter always has a value."""
+
+
+class ParameterError(ValueError):
+    """A parameter that is unknown, out of range or in contradiction to the run: names it, its value and the remedy."""
+
+
+@dataclass(frozen=True)
+class Own:
+    """A parameter of the node itself, no setting of the run."""
+
+    default: str | float
+    description: str
+    low: float = 0.0
+    high: float = 86_400.0
+
+    def descriptor(self) -> ParameterDescriptor:
+        """What `ros2 param describe` shows."""
+        if isinstance(self.default, str):
+            return ParameterDescriptor(
+                type=Type.STRING.value, description=self.description, read_only=True
+            )
+        return ParameterDescriptor(
+            type=Type.DOUBLE.value,
+            description=self.description,
+            read_only=True,
+            floating_point_range=[FloatingPointRange(from_value=self.low, to_value=self.high)],
+        )
+
+
+OWN: dict[str, Own] = {
+    'run_id': Own('', 'id of the run; of the learner: the one it gives (empty: made from the date), of all others: '
+                  'the only one they join (empty: any)'),
+    'folder': Own('', 'folder of the run, for checkpoints, bag and the report of the node; empty: nothing is written'),
+    'peer_deadline': Own(60.0, 'seconds that the node waits for peers that are missing or silent; 0: for ever'),
+}  # fmt: skip
+OWN_OF_ROLE: dict[str, dict[str, Own]] = {
+    'learner': {
+        'config': Own('quick', 'settings to start from: a preset (quick, cpu, paper) or a YAML file'),
+    },
+    'record': {
+        'bag': Own('', 'folder of the bag; empty: `bag` in `folder`, or where that is empty too no bag at all'),
+    },
+}
+
+
+def own_parameters(role: str) -> dict[str, Own]:
+    """The parameters that a node of this role has besides the settings."""
+    return OWN | OWN_OF_ROLE.get(role, {})
+
+
+def _settings_fields(model: type[BaseModel], prefix: str = '') -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, field in model.model_fields.items():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            found |= _settings_fields(field.annotation, f'{prefix}{name}.')
+        else:
+            found[prefix + name] = field
+    return found
+
+
+FIELDS = _settings_fields(Settings)
+"""Every setting by its dotted name."""
+
+
+def _bounds(field: Any) -> tuple[float | None, float | None, list[str]]:
+    low: Any = None
+    high: Any = None
+    said = []
+    for rule in field.metadata:
+        if isinstance(rule, (Ge, Gt)):
+            low = rule.ge if isinstance(rule, Ge) else rule.gt
+            if isinstance(rule, Gt):
+                said.append(f'greater than {low:g}')
+        elif isinstance(rule, (Le, Lt)):
+            high = rule.le if isinstance(rule, Le) else rule.lt
+            if isinstance(rule, Lt):
+                said.append(f'less than {high:g}')
+        elif isinstance(rule, (MinLen, MaxLen)):
+            least = isinstance(rule, MinLen)
+            n = rule.min_length if least else rule.max_length  # type: ignore[union-attr]
+            said.append(f'length at {"least" if least else "most"} {n}')
+    return low, high, said
+
+
+def _plain(annotation: Any) -> tuple[Any, bool]:
+    """The type behind `T | None`, and whether None is allowed."""
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        inner = [a for a in typing.get_args(annotation) if a is not type(None)]
+        return inner[0], True
+    return annotation, False
+
+
+def descriptor(name: str) -> ParameterDescriptor:
+    """Type, description and range of a setting, from its pydantic field."""
+    field = FIELDS[name]
+    kind, optional = _plain(field.annotation)
+    low, high, said = _bounds(field)
+    shown = ParameterDescriptor(description=field.description or '', read_only=True)
+    if typing.get_origin(kind) is Literal:
+        shown.type = Type.STRING.value
+        said.append('one of: ' + ', '.join(typing.get_args(kind)))
+    elif typing.get_origin(kind) is tuple:
+        shown.type = Type.INTEGER_ARRAY.value
+    elif kind is bool:
+        shown.type = Type.BOOL.value
+    elif kind is int:
+        shown.type = Type.INTEGER.value
+        if low is not None and high is not None:
+            shown.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
+    elif kind is float:
+        shown.type = Type.DOUBLE.value
+        if low is not None and high is not None:
+            shown.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
+    else:
+        shown.type = Type.STRING.value
+    if optional:
+        said.append(f'{NOT_GIVEN:g}: not given')
+    shown.additional_constraints = '; '.join(said)
+    return shown
+
+
+def _outward(value: Any) -> Any:
+    if value is None:
+        return NOT_GIVEN
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _inward(name: str, value: Any) -> Any:
+    _, optional = _plain(FIELDS[name].annotation)
+    if optional and value == NOT_GIVEN:
+        return None
+    return value if isinstance(value, (str, bool, int, float)) else list(value)
+
+
+def overrides(node: Node) -> dict[str, Any]:
+    """What the user gave on the command line or in a parameter file, for any parameter."""
+    # rclpy offers no public way to see overrides before they are declared
+    return {name: parameter.value for name, parameter in node._parameter_overrides.items()}
+
+
+def check_names(node: Node, role: str) -> None:
+    """Refuse parameters that do not exist.
+
+    Raises:
+        ParameterError: names all of them, and what there is.
+    """
+    known = set(FIELDS) | set(own_parameters(role))
+    unknown = {
+        name: value
+        for name, value in overrides(node).items()
+        if name not in known and not node.has_parameter(name) and not name.startswith('qos_overrides.')
+    }
+    if unknown:
+        given = ', '.join(f'{name}={value!r}' for name, value in sorted(unknown.items()))
+        raise ParameterError(
+            f'{node.get_fully_qualified_name()} has no parameter {given}. There are: {", ".join(sorted(known))}'
+        )
+
+
+def declare_own(node: Node, role: str) -> dict[str, Any]:
+    """Declare the node's own parameters and return their values.
+
+    Raises:
+        ParameterError: one is of the wrong type or out of range.
+    """
+    given = overrides(node)
+    values: dict[str, Any] = {}
+    for name, own in own_parameters(role).items():
+        value = given.get(name, own.default)
+        if isinstance(own.default, str):
+            value = str(value)  # a run id of digits only arrives as a number
+        elif isinstance(value, bool) or not isinstance(value, (int, float)) or not own.low <= value <= own.high:
+            raise ParameterError(
+                f'{node.get_fully_qualified_name()}: parameter {name} = {value!r} must be a number from '
+                f'{own.low:g} to {own.high:g} ({own.description})'
+            )
+        else:
+            value = float(value)
+        node.declare_parameter(name, value, own.descriptor(), ignore_override=True)
+        values[name] = value
+    return values
+
+
+def declare_settings(node: Node, settings: Settings) -> None:
+    """Declare every setting as a read-only parameter with the run's value."""
+    for name, value in settings.flat().items():
+        shown = descriptor(name)
+        node.declare_parameter(
+            name, Parameter(name, Type(shown.type), _outward(value)).value, shown, ignore_override=True
+        )
+
+
+def own_settings(node: Node, config: str) -> Settings:
+    """The settings that a learner's parameters ask for: its `config`, changed by what was given one by one.
+
+    Raises:
+        ParameterError: a setting is refused; names it, its value and what is allowed.
+    """
+    given = {name: _inward(name, value) for name, value in overrides(node).items() if name in FIELDS}
+    try:
+        return load(config).changed(given, f'{node.get_fully_qualified_name()}: parameter')
+    except SettingsError as error:
+        raise ParameterError(str(error)) from None
+
+
+def check_against_run(node: Node, settings: Settings, owner: str) -> None:
+    """Refuse a parameter that contradicts the run's settings.
+
+    Args:
+        node: who was given parameters.
+        settings: of the run.
+        owner: name of the learner whose run it is.
+
+    Raises:
+        ParameterError: names every such parameter, both values and both nodes.
+    """
+    given: Mapping[str, Any] = {name: value for name, value in overrides(node).items() if name in FIELDS}
+    name_of_node = node.get_fully_qualified_name()
+    run = settings.flat()
+    wrong = []
+    for name, value in given.items():
+        try:
+            same = settings.changed({name: _inward(name, value)}, f'{name_of_node}: parameter') == settings
+        except SettingsError as error:
+            raise ParameterError(str(error)) from None
+        if not same:
+            wrong.append(f'{name} = {value!r}, but {owner} has {name} = {run[name]!r}')
+    if wrong:
+        raise ParameterError(
+            f'{name_of_node}: parameters contradict the run: {"; ".join(wrong)}. Leave them out (the node takes '
+            f'them from the run) or start {owner} with them'
+        )

@@ -1,0 +1,148 @@
+"""Who takes part in a run: which roles it needs, who has said `Presence`, who is missing or silent.
+
+A node begins only when every peer that its topics need is there and matched, by name: a count of subscriptions
+cannot tell a recorder from `ros2 topic echo`. From then on nothing is lost (reliable, deep enough queues), and
+what peers say they have published tells a node what never reached it.
+"""
+
+from collections import Counter, deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from codetr_ros.config import Settings
+from codetr_ros.records import Presence
+
+READERS: dict[str, tuple[str, ...]] = {
+    'run': ('sim', 'evaluate', 'reward', 'record'),
+    'task': ('learner', 'reward', 'record'),
+    'policy': ('sim', 'evaluate', 'record'),
+    'transitions': ('record', 'reward', 'learner'),
+    'composite_rewards': ('record', 'reward'),
+    'commits': ('reward', 'learner'),
+    'step_rewards': ('learner', 'record'),
+    'episodes': ('record',),
+    'true_rewards': ('record',),
+    'metrics': ('record',),
+}
+"""Roles that must read what is published on a topic."""
+WRITERS: dict[str, tuple[str, ...]] = {
+    'run': ('learner',),
+    'task': ('sim',),
+    'policy': ('learner',),
+    'transitions': ('sim',),
+    'composite_rewards': ('sim',),
+    'commits': ('record',),
+    'step_rewards': ('reward',),
+    'episodes': ('sim', 'evaluate'),
+    'true_rewards': ('sim',),
+    'metrics': ('sim', 'evaluate', 'reward', 'learner', 'record'),
+}
+"""Roles that publish on a topic."""
+COMMANDS = {
+    'sim': 'ros2 run sim_node sim',
+    'evaluate': 'ros2 run sim_node evaluate',
+    'reward': 'ros2 run reward_node reward',
+    'learner': 'ros2 run learner_node learner',
+    'record': 'ros2 run codetr_ros record',
+}
+"""What starts a node of a role, for errors."""
+
+
+def needed(settings: Settings) -> dict[str, int]:
+    """How many nodes of each role a run needs."""
+    roles = {'sim': settings.simulators, 'reward': 1, 'learner': 1, 'record': 1}
+    return roles | ({'evaluate': 1} if settings.evaluate_every else {})
+
+
+def published_by(role: str) -> tuple[str, ...]:
+    """Topics that a role publishes on."""
+    return tuple(topic for topic, roles in WRITERS.items() if role in roles)
+
+
+@dataclass
+class Peer:
+    """Another node, as its last `Presence` has it."""
+
+    said: Presence
+    heard: float  # monotonic time [s] of its last word
+
+    @property
+    def published(self) -> dict[str, int]:
+        """Records that it says it has published, by topic."""
+        return dict(zip(self.said.topics, self.said.published.tolist(), strict=True))
+
+
+@dataclass
+class Peers:
+    """The other nodes of the run, by instance (a process that was started again is another one)."""
+
+    role: str
+    by_instance: dict[str, Peer] = field(default_factory=dict)
+
+    def hear(self, said: Presence, now: float) -> str | None:
+        """Note a peer's presence; returns what is new about it, for the log."""
+        known = self.by_instance.get(said.instance_id)
+        self.by_instance[said.instance_id] = Peer(said, now)
+        if known is None:
+            before = [p for p in self.by_instance.values() if p.said.node == said.node]
+            again = ' again' if len(before) > 1 else ''
+            return f'{said.role} {said.node} is there{again}'
+        if said.finished and not known.said.finished:
+            return f'{said.role} {said.node} has finished'
+        return None
+
+    def alive(self, role: str) -> list[Peer]:
+        """Peers of a role, the newest instance of each node."""
+        newest: dict[str, Peer] = {}
+        for peer in self.by_instance.values():
+            old = newest.get(peer.said.node)
+            if peer.said.role == role and (old is None or peer.heard >= old.heard):
+                newest[peer.said.node] = peer
+        return list(newest.values())
+
+    def absent(self, settings: Settings, settings_hash: str) -> list[str]:
+        """Roles of which too few nodes with the run's settings are there, with what would start them."""
+        missing = []
+        for role, count in needed(settings).items():
+            have = len([p for p in self.alive(role) if p.said.settings_hash == settings_hash])
+            have += role == self.role
+            if have < count:
+                of = f' {have + 1} of {count}' if count > 1 else ''
+                missing.append(f'{role}{of} (start it with `{COMMANDS[role]}` in this namespace)')
+        return missing
+
+    def awaited(self, topics: Iterable[str]) -> list[Peer]:
+        """Peers that publish on one of these topics."""
+        roles = {role for topic in topics for role in WRITERS.get(topic, ())}
+        return [peer for role in sorted(roles) for peer in self.alive(role)]
+
+    def told(self) -> 'Counter[str]':
+        """Records that all peers say they have published, by topic."""
+        total: Counter[str] = Counter()
+        for peer in self.by_instance.values():
+            total.update(peer.published)
+        return total
+
+
+class Ledger:
+    """Says what was published but never arrived.
+
+    A `Presence` may overtake the messages it counts, so a record counts as lost only when it has not come
+    `patience` seconds after its publisher said that it was published.
+    """
+
+    def __init__(self, patience: float = 5.0) -> None:
+        self._patience = patience
+        self._told: deque[tuple[float, Counter[str]]] = deque()
+        self._due: Counter[str] = Counter()
+
+    def tell(self, told: 'Counter[str]', now: float) -> None:
+        """Note what peers say they have published by now."""
+        if not self._told or self._told[-1][1] != told:
+            self._told.append((now, told))
+
+    def lost(self, received: 'Counter[str]', now: float) -> dict[str, int]:
+        """Records missing by topic; only topics of which some are."""
+        while self._told and self._told[0][0] <= now - self._patience:
+            self._due = self._told.popleft()[1]
+        return {topic: n - received[topic] for topic, n in sorted(self._due.items()) if n > received[topic]}

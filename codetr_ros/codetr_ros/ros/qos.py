@@ -1,0 +1,86 @@
+"""Quality of service, named once per topic.
+
+Reliable everywhere. What a late joiner must still hear (`run`, `task`, `policy`, `commits`) is transient local. Every
+queue is deeper than what the permitted phases can put on its topic: KEEP_LAST would drop the rest silently, and
+KEEP_ALL blocks the publisher. `max(FLOOR, MARGIN * most)` is the depth, where `most` is, for P = lag + 1 phases
+(one more than is ever permitted and not yet committed) of N = phase_steps steps, all simulators together:
+
+    transitions, true_rewards   P * N                      a chunk has at least one step
+    composite_rewards           P * N                      a segment has at least one step
+    episodes                    P * N + evaluate_episodes  an episode has at least one step
+    step_rewards                P * (simulators + ceil(16 * memory_steps / 100 kB))
+                                                           at most 4 bytes for each label and 12 for its segment,
+                                                           in parts of more than half of 200 kB
+    metrics                     P * (4 + simulators) * 4   a few from each node and phase
+    policy                      P + ceil(4000 / N)         and those that come while an evaluation episode runs
+    commits, task               P; simulators
+
+A depth costs nothing by itself: the middleware keeps what has been published, not room for what might be.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import ceil
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from codetr_ros.config import Settings
+
+FLOOR = 16
+MARGIN = 1.25
+PART_BYTES = 100_000
+"""Half of what fills a part of step rewards: the other half may be left empty."""
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Durability of a topic, and the most messages that may be under way on it."""
+
+    transient_local: bool
+    most: Callable[[Settings], int]
+
+
+def _phases(settings: Settings) -> int:
+    return settings.lag + 1
+
+
+def _steps(settings: Settings) -> int:
+    return _phases(settings) * settings.phase_steps
+
+
+QUALITIES: dict[str, Quality] = {
+    'run': Quality(True, lambda s: 1),
+    'presence': Quality(False, lambda s: 256),
+    'task': Quality(True, lambda s: s.simulators),
+    'policy': Quality(True, lambda s: _phases(s) + ceil(4000 / s.phase_steps)),
+    'transitions': Quality(False, _steps),
+    'composite_rewards': Quality(False, _steps),
+    'commits': Quality(True, _phases),
+    'step_rewards': Quality(
+        False, lambda s: _phases(s) * (s.simulators + ceil(16 * s.memory_steps / PART_BYTES))
+    ),
+    'episodes': Quality(False, lambda s: _steps(s) + s.evaluate_episodes),
+    'true_rewards': Quality(False, _steps),
+    'metrics': Quality(False, lambda s: _phases(s) * (4 + s.simulators) * 4),
+}
+
+
+def depth(topic: str, settings: Settings | None = None) -> int:
+    """Depth of a topic's queues, at both ends.
+
+    Args:
+        topic: relative name, one of `records.TOPICS`.
+        settings: of the run; not needed for `run` and `presence`, which come before the settings are known.
+    """
+    return max(FLOOR, ceil(MARGIN * QUALITIES[topic].most(settings or Settings())))
+
+
+def profile(topic: str, settings: Settings | None = None) -> QoSProfile:
+    """QoS profile of a topic, for publishers and subscriptions alike."""
+    durable = QUALITIES[topic].transient_local
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth(topic, settings),
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if durable else DurabilityPolicy.VOLATILE,
+    )

@@ -1,0 +1,29 @@
+"""`ros2 run codetr_ros record`: writes the bag of a run and commits its phases."""
+
+import sys
+from typing import TYPE_CHECKING
+
+from codetr_ros.ros.signals import Stop
+
+if TYPE_CHECKING:
+    from codetr_ros.ros.node import MakeCore
+
+
+def load() -> 'MakeCore':
+    """Import the core and return what makes it."""
+    from codetr_ros.recorder import Recorder
+
+    return lambda run, settings, name, folder: Recorder(run, settings, name)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; the imports follow the signal handlers, since they take a while."""
+    stop = Stop().install()
+    from codetr_ros.ros.node import run_node
+    from codetr_ros.ros.recording import RecordNode
+
+    return run_node('record', 'record', load, argv, stop, RecordNode)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

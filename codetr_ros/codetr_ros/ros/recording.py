@@ -1,0 +1,245 @@
+"""The recorder's wiring: writes what arrives as it came, and commits phases.
+
+Everything is appended to the bag as received bytes before the core sees it, and the bag is flushed and synced before
+a commit goes out: nobody learns from what could be lost. Without a bag the last phases are kept in memory only. In
+both cases the service `fetch_phase` sends one of the last committed phases again.
+"""
+
+import time
+from collections import Counter, deque
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from codetr_msgs.srv import FetchPhase
+from rclpy.serialization import deserialize_message, serialize_message
+
+from codetr_ros import run_folder
+from codetr_ros.bags.writer import BagTopic, McapWriter
+from codetr_ros.config import Settings
+from codetr_ros.records import (
+    TOPICS,
+    Commit,
+    CompositeReward,
+    Presence,
+    Record,
+    RecordError,
+    RunSpec,
+    StepRewards,
+    Transitions,
+)
+from codetr_ros.ros import messages, qos
+from codetr_ros.ros.fetch import SERVICE
+from codetr_ros.ros.node import CoreNode, MakeCore
+from codetr_ros.ros.peers import published_by
+from codetr_ros.ros.signals import Stop
+
+NOT_RECORDED = (Presence,)
+"""Says who is alive, once a second: nothing of the run itself."""
+
+
+class FirstLabels:
+    """What of the step rewards goes into the bag when it keeps first labels only.
+
+    Every part is kept, so that the bag has as many as were published; a part holds the segments labelled for the first
+    time, or all of them where the phase's policy is evaluated.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._seen: set[tuple[str, int, int]] = set()
+
+    def keep(self, part: StepRewards) -> StepRewards | None:
+        """The part reduced to what is kept; None if all of it is."""
+        keys = [
+            (part.source, episode, first)
+            for episode, first in zip(part.episodes.tolist(), part.first_steps.tolist(), strict=True)
+        ]
+        fresh = np.array([key not in self._seen for key in keys], bool)
+        self._seen.update(keys)
+        if fresh.all() or self._settings.evaluated(part.phase):
+            return None
+        return replace(
+            part,
+            source=part.source if fresh.any() else '',
+            episodes=part.episodes[fresh],
+            first_steps=part.first_steps[fresh],
+            lengths=part.lengths[fresh],
+            labels=part.labels[np.repeat(fresh, part.lengths)],
+        )
+
+
+class LastPhases:
+    """The received bytes of the last committed phases, and of what no commit has named yet."""
+
+    def __init__(self, phases: int) -> None:
+        self._open: dict[tuple[type, str, int], bytes] = {}
+        self._committed: dict[int, list[tuple[type, bytes]]] = {}
+        self._phases = phases
+
+    def hold(self, record: Record, raw: bytes) -> None:
+        """Keep the bytes of a record that a commit will name."""
+        if isinstance(record, Transitions):
+            self._open.setdefault((Transitions, record.source, record.sequence), raw)
+        elif isinstance(record, CompositeReward):
+            self._open.setdefault((CompositeReward, record.scorer, record.sequence), raw)
+
+    def commit(self, commit: Commit, raw: bytes) -> None:
+        """File under the commit's phase what it names; forget the oldest phase."""
+        last = {(Transitions, s): n for s, n in zip(commit.sources, commit.transitions.tolist(), strict=True)}
+        last |= {(CompositeReward, s): n for s, n in zip(commit.scorers, commit.scores.tolist(), strict=True)}
+        named = [key for key in self._open if key[2] <= last.get(key[:2], -1)]
+        self._committed[commit.phase] = [(key[0], self._open.pop(key)) for key in named] + [(Commit, raw)]
+        while len(self._committed) > self._phases:
+            del self._committed[min(self._committed)]
+
+    def get(self, phase: int) -> list[tuple[type, bytes]]:
+        """Kind and bytes of each message of a committed phase.
+
+        Raises:
+            KeyError: the phase is not held; the message says which ones are.
+        """
+        if phase not in self._committed:
+            held = ', '.join(map(str, sorted(self._committed))) or 'none yet'
+            raise KeyError(f'phase {phase} is not in memory; these are: {held}')
+        return self._committed[phase]
+
+
+class RecordNode(CoreNode):
+    """The recorder's core, wired to ROS and to a bag."""
+
+    def __init__(self, role: str, name: str, make_core: MakeCore, stop: Stop) -> None:
+        super().__init__(role, name, make_core, stop)
+        self._bag: McapWriter | None = None
+        self._run_message: bytes | None = None
+        self._full: dict[type, str] = {}
+        self._recorded: Counter[str] = Counter()
+        self._missed: dict[str, int] = {}
+        self._flush_seconds: list[float] = []
+
+    def open_topics(self, settings: Settings) -> None:
+        """Open the bag, then subscribe to everything as raw bytes."""
+        node = self.link.node
+        self._first = FirstLabels(settings) if settings.record_relabels == 'first' else None
+        self._last = LastPhases(settings.lag + 2)
+        kinds = [kind for kind in TOPICS if kind not in NOT_RECORDED]
+        self._full = {kind: node.resolve_topic_name(TOPICS[kind]) for kind in kinds}
+        folder = Path(self.values['bag']) if self.values['bag'] else self.folder and self.folder / run_folder.BAG
+        if folder:
+            self._bag = McapWriter(folder, [self._bag_topic(kind, settings) for kind in kinds])
+            self.log.info(f'records to {folder}')
+        assert self._run_message is not None
+        self._write(RunSpec, self._run_message)
+        for kind in kinds:
+            if kind not in (RunSpec, Commit):  # the one has come, the other is our own
+                self.link.subscribe(kind, self._take_raw, settings, raw=True)
+        node.create_service(FetchPhase, SERVICE, self._send_again)
+
+    def _bag_topic(self, kind: type, settings: Settings) -> BagTopic:
+        topic = TOPICS[kind]
+        durable = qos.QUALITIES[topic].transient_local
+        return BagTopic(self._full[kind], messages.type_name(kind), qos.depth(topic, settings), durable)
+
+    def _take(self, record_type: type, message: Any) -> None:
+        joined = self.run_spec is not None
+        super()._take(record_type, message)
+        if not joined and self.run_spec is not None:
+            self._run_message = serialize_message(message)
+
+    def _take_raw(self, kind: type, raw: bytes) -> None:
+        self.received[TOPICS[kind]] += 1
+        message = deserialize_message(raw, messages.message_type(kind))
+        published = message.stamp.sec * 10**9 + message.stamp.nanosec
+        try:
+            record = messages.from_message(message)
+        except RecordError as error:
+            self._write(kind, raw, published)  # the bag tells what came, sound or not
+            self.refuse(kind, error)
+            return
+        kept = self._first.keep(record) if self._first and isinstance(record, StepRewards) else None
+        if kept is None:
+            self._write(kind, raw, published)
+        else:
+            self._write(kind, serialize_message(messages.to_message(kept, message.stamp)), published)
+        if self.core is not None and kind in self.core.subscribes:
+            self._last.hold(record, raw)
+            self._receive(record)
+
+    def _write(self, kind: type, raw: bytes, published: int | None = None) -> None:
+        now = self.link.node.get_clock().now().nanoseconds
+        if self._bag is not None:
+            self._bag.write(self._full[kind], raw, now, published)
+        self._recorded[TOPICS[kind]] += 1
+
+    def deliver(self, record: Record) -> None:
+        """Pass on a record of the core; a commit only once what it names is on the disk."""
+        if not isinstance(record, Commit):
+            super().deliver(record)
+            return
+        if self._bag is not None:
+            began = time.perf_counter()
+            self._bag.flush()
+            self._flush_seconds.append(time.perf_counter() - began)
+        raw = serialize_message(self.link.publish(record))
+        self._last.commit(record, raw)
+        self._write(Commit, raw)
+
+    def _send_again(self, request: FetchPhase.Request, response: FetchPhase.Response) -> FetchPhase.Response:
+        own = self.run_spec.run_id if self.run_spec else ''
+        if request.run_id != own:
+            response.reason = f'this recorder is of run {own!r}, not {request.run_id!r}: ask that of your run'
+            return response
+        try:
+            found = self._last.get(request.phase)
+        except KeyError as error:
+            response.reason = str(error.args[0])
+            return response
+        self.log.warning(f'{request.requester} lacks something of phase {request.phase}: sending it again')
+        response.found = True
+        response.types = [messages.type_name(kind) for kind, _ in found]
+        response.lengths = [len(raw) for _, raw in found]
+        response.cdr = b''.join(raw for _, raw in found)
+        return response
+
+    def _still_missing(self) -> dict[str, int]:
+        told = self.peers.told()
+        told.update({t: n for t, n in self.link.published.items() if t in published_by(self.role)})
+        arrived = self.received + Counter({TOPICS[Commit]: self._recorded[TOPICS[Commit]]})
+        return {topic: n - arrived[topic] for topic, n in sorted(told.items()) if n > arrived[topic]}
+
+    def settled(self, seconds: float) -> bool:
+        """Whether everybody has finished and all that they published is in the bag."""
+        running = [f'{p.said.role} {p.said.node}' for p in self.peers.by_instance.values() if not p.said.finished]
+        self._missed = self._still_missing()
+        if not running and not self._missed:
+            return True
+        lacking = [f'{n} of {topic}' for topic, n in self._missed.items()]
+        self._doing = f'waits for the end of {", ".join(running) or "nobody"} and for {", ".join(lacking) or "nothing"}'
+        deadline = self.values['peer_deadline']
+        # somebody who still speaks may work as long as it takes
+        heard = max((p.heard for p in self.peers.by_instance.values()), default=0.0)
+        silent = time.monotonic() - heard
+        if deadline and min(seconds, silent) > deadline:
+            self.log.error(f'gave up after {deadline:g} s: {self._doing}')
+            return True
+        return False
+
+    def lost(self) -> dict[str, int]:
+        """Records that were published and never came, by topic: for certain at the end, before as others see it."""
+        return self._missed if self.core and self.core.finished else super().lost()
+
+    def closing(self) -> None:
+        """Finish the bag."""
+        if self._bag is not None:
+            self._bag.close()
+
+    def own_report(self) -> dict[str, Any]:
+        """What was recorded, and where."""
+        flushes = sorted(self._flush_seconds) or [0.0]
+        return {
+            'recorded': dict(self._recorded),
+            'bag': str(self._bag.folder) if self._bag else None,
+            'bag_bytes': self._bag.size if self._bag else 0,
+            'flush_ms': {'median': 1e3 * flushes[len(flushes) // 2], 'max': 1e3 * flushes[-1]},
+        }

@@ -1,0 +1,37 @@
+"""Stop on SIGINT and SIGTERM without a traceback, whatever the process is doing.
+
+rclpy's own handlers shut the context down from a thread, which races with everything that still publishes
+(a double `shutdown`, publishing on an invalid context, a KeyboardInterrupt in the middle of a record). Here a
+signal sets a flag, which the main loop looks at; a second signal changes nothing.
+"""
+
+import signal
+from types import FrameType
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Stop:
+    """True once somebody has asked the process to stop."""
+
+    def __init__(self) -> None:
+        self.signal: signal.Signals | None = None
+
+    def __bool__(self) -> bool:
+        return self.signal is not None
+
+    def _note(self, number: int, _frame: FrameType | None) -> None:
+        if self.signal is None:
+            self.signal = signal.Signals(number)
+
+    def install(self) -> 'Stop':
+        """Take the two signals; call it first of all, before anything slow is imported."""
+        for number in SIGNALS:
+            signal.signal(number, self._note)
+        return self
+
+
+def ignore() -> None:
+    """Ignore both from now on: last of all, since an interpreter that ends restores the deadly defaults."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)

@@ -1,0 +1,108 @@
+"""Sees a run from outside: presence, task, episodes, metrics and commits of a namespace, for progress and summary."""
+
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any
+
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+
+from codetr_ros.records import (
+    TOPICS,
+    Commit,
+    EpisodeResult,
+    Metrics,
+    Presence,
+    Record,
+    RecordError,
+    RunSpec,
+    TaskSpec,
+)
+from codetr_ros.ros import messages, qos
+
+WATCHED = (RunSpec, Presence, TaskSpec, Commit, EpisodeResult, Metrics)
+"""What tells how a run goes; the data themselves are left alone."""
+DEPTH = 10_000
+"""The settings, and with them what may be under way, are not known when watching begins."""
+
+
+class Watcher:
+    """Hands every record that tells how a run goes to a function. A context manager.
+
+    It has a ROS context of its own, takes no signals, and counts for nobody as a peer.
+
+    Args:
+        on_record: called by `poll`, in the thread that polls.
+        namespace: of the run, such as '/run_1'.
+        name: node name.
+    """
+
+    def __init__(self, on_record: Callable[[Record], None], namespace: str, name: str = 'watch') -> None:
+        self._on_record = on_record
+        self._namespace = namespace
+        self._name = name
+        self._inbox: list[Any] = []
+        self._events = 0
+        self.refused = 0
+
+    def __enter__(self) -> 'Watcher':
+        self._context = Context()
+        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        self._node = Node(self._name, context=self._context, namespace=self._namespace, use_global_arguments=False)
+        self._executor = EventsExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        for kind in WATCHED:
+            durable = qos.QUALITIES[TOPICS[kind]].transient_local
+            self._node.create_subscription(
+                messages.message_type(kind),
+                TOPICS[kind],
+                self._store,
+                QoSProfile(
+                    depth=DEPTH,
+                    reliability=ReliabilityPolicy.RELIABLE,
+                    durability=DurabilityPolicy.TRANSIENT_LOCAL if durable else DurabilityPolicy.VOLATILE,
+                ),
+            )
+        return self
+
+    def _store(self, message: Any) -> None:
+        self._events += 1
+        self._inbox.append(message)
+
+    def poll(self, timeout: float) -> int:
+        """Wait until something arrives, at most `timeout` seconds, and hand over all that has.
+
+        Returns:
+            How many records were handed over.
+        """
+        try:
+            self._executor.spin_once(timeout_sec=timeout)
+            while True:
+                seen = self._events
+                self._executor.spin_once(timeout_sec=0)
+                if self._events == seen:
+                    break
+        except ExternalShutdownException:
+            return 0
+        arrived, self._inbox = self._inbox, []
+        for message in arrived:
+            try:
+                record = messages.from_message(message)
+            except RecordError:
+                self.refused += 1
+                continue
+            self._on_record(record)
+        return len(arrived)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._executor.remove_node(self._node)
+        self._node.destroy_node()
+        self._executor.shutdown()
+        self._context.try_shutdown()

@@ -1,0 +1,192 @@
+"""The folder of a run: what lies where in it, and how files get there.
+
+Every file is written under a temporary name, synced to the disk and renamed, so that a reader (or
+a machine that lost its power) sees the whole old file or the whole new one, never a part.
+"""
+
+import json
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from codetr_ros import config
+
+CONFIG = 'config.yaml'
+BAG = 'bag'
+CHECKPOINTS = 'checkpoints'
+NODES = 'nodes'
+LOGS = 'logs'
+SUMMARY = 'summary.json'
+METRICS = 'metrics.csv'
+REPORT = 'report.html'
+PICTURE = 'learning_curve.png'
+
+
+class RunFolderError(ValueError):
+    """A folder that cannot hold a run, or that does not hold one: names it and says what to do."""
+
+
+def sync_folder(folder: Path) -> None:
+    """Make renames and new names in a folder survive a power loss."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_synced(path: Path, data: bytes) -> None:
+    """Write a file and wait until it is on the disk."""
+    with path.open('wb') as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def atomic_write(path: Path, data: bytes | str) -> None:
+    """Write a file whole or not at all: temporary name in the same folder, fsync, rename.
+
+    Args:
+        path: the file; one that exists is replaced.
+        data: its content; text becomes UTF-8.
+
+    Raises:
+        OSError: the disk is full or the folder cannot be written; `path` is then as it was.
+    """
+    content = data.encode() if isinstance(data, str) else data
+    partial = path.with_name(f'.{path.name}.{os.getpid()}.partial')
+    try:
+        write_synced(partial, content)
+        os.replace(partial, path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
+    sync_folder(path.parent)
+
+
+def check(path: Path) -> None:
+    """Say whether `create` would accept this folder, without making anything.
+
+    Raises:
+        RunFolderError: it exists and is not empty, is not a folder, or cannot be written.
+    """
+    if path.exists():
+        if not path.is_dir():
+            raise RunFolderError(f'output folder {path} is a file: choose another with --out')
+        if not os.access(path, os.W_OK | os.X_OK):
+            raise RunFolderError(
+                f'output folder {path} cannot be written: change its permissions '
+                'or choose another with --out'
+            )
+        if found := sorted(entry.name for entry in path.iterdir()):
+            shown = ', '.join(found[:3]) + (', ...' if len(found) > 3 else '')
+            raise RunFolderError(
+                f'output folder {path} exists and is not empty ({shown}): '
+                'choose another with --out, or remove it'
+            )
+        return
+    parent = path.absolute().parent
+    while not parent.exists():
+        parent = parent.parent
+    if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
+        raise RunFolderError(
+            f'output folder {path} cannot be made, {parent} cannot be written: '
+            'change its permissions or choose another with --out'
+        )
+
+
+def create(path: Path) -> Path:
+    """Make the folder of a new run, with the folders in it that every run has.
+
+    Returns:
+        The absolute path.
+
+    Raises:
+        RunFolderError: it exists and is not empty, or it cannot be written.
+    """
+    check(path)
+    folder = path.absolute()
+    try:
+        for name in (NODES, LOGS, CHECKPOINTS):
+            (folder / name).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunFolderError(
+            f'output folder {path} cannot be made ({error.strerror}): choose another with --out'
+        ) from error
+    return folder
+
+
+def write_settings(folder: Path, settings: config.Settings) -> Path:
+    """Write every setting to the run's `config.yaml`, from which `config.load` reads them."""
+    path = folder / CONFIG
+    text = yaml.safe_dump(settings.model_dump(mode='json'), sort_keys=False)
+    note = f'# Every setting of this run: `codetr train --config {CONFIG}` repeats it.'
+    atomic_write(path, f'{note}\n{text}')
+    return path
+
+
+def read_settings(folder: Path) -> config.Settings:
+    """The settings of the run whose folder this is.
+
+    Raises:
+        RunFolderError: there is no `config.yaml`, so this is not the folder of a run.
+        SettingsError: it holds settings that are refused.
+    """
+    path = folder / CONFIG
+    if not path.is_file():
+        raise RunFolderError(
+            f'{folder} is not the folder of a run, it has no {CONFIG}: '
+            'give the folder that `codetr train` named'
+        )
+    return config.load(str(path))
+
+
+def _file_name(text: str) -> str:
+    return re.sub(r'[^A-Za-z0-9_.]+', '_', text).strip('_') or 'unnamed'
+
+
+def report_path(folder: Path, role: str, name: str) -> Path:
+    """Where the node of this role and (fully qualified or plain) name leaves its report."""
+    return folder / NODES / f'{role}-{_file_name(name.rsplit("/", 1)[-1])}.json'
+
+
+def write_report(folder: Path, role: str, name: str, report: dict[str, Any]) -> Path:
+    """Write what a node did to `nodes/<role>-<name>.json`.
+
+    Args:
+        folder: the run's folder.
+        role: one of `records.ROLES`.
+        name: node name; of a fully qualified one the last part becomes the file's name.
+        report: JSON-able; `role` and `name` are added where missing.
+    """
+    path = report_path(folder, role, name)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    atomic_write(path, json.dumps({'role': role, 'name': name} | report, indent=2) + '\n')
+    return path
+
+
+def read_report(path: Path) -> dict[str, Any]:
+    """One node's report.
+
+    Raises:
+        RunFolderError: it is not a JSON object.
+    """
+    try:
+        report = json.loads(path.read_text())
+    except ValueError as error:
+        raise RunFolderError(f'node report {path} is not JSON ({error})') from None
+    if not isinstance(report, dict):
+        raise RunFolderError(f'node report {path} holds {type(report).__name__}, not an object')
+    return report
+
+
+def read_reports(folder: Path) -> dict[str, dict[str, Any]]:
+    """All node reports that are there, by `<role>-<name>`.
+
+    Raises:
+        RunFolderError: one of them is damaged.
+    """
+    return {path.stem: read_report(path) for path in sorted((folder / NODES).glob('*.json'))}

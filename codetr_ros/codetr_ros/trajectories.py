@@ -1,0 +1,535 @@
+"""The memory D: whole trajectories, their scored segments and their step rewards.
+
+Both the reward side and the learner keep one. Each observation is stored once; a step costs
+`Trajectories.bytes_per_step` bytes. What is added is checked against what is there, so that a wrong record is
+refused and changes nothing.
+"""
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from codetr_ros.records import (
+    F32,
+    F64,
+    I64,
+    CompositeReward,
+    RecordError,
+    StepRewards,
+    Transitions,
+    TrueRewards,
+)
+
+_SOURCE_SHIFT = 40  # a segment id is (source index << 40) | number of the segment within its source
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class StepBatch:
+    """Labelled steps for the policy learner; B = batch, O = observation size, A = action size."""
+
+    observations: F32  # (B, O)
+    actions: F32  # (B, A)
+    rewards: F32  # (B,) inferred step rewards
+    next_observations: F32  # (B, O)
+    terminated: NDArray[np.bool_]  # (B,) nothing is bootstrapped from the next observation
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SegmentBatch:
+    """Segments, or windows that end in one, padded with zeros on the right to L steps."""
+
+    observations: F32  # (B, L+1, O): the observation before each step, and the one after the last
+    actions: F32  # (B, L, A)
+    lengths: I64  # (B,) steps in the window, context included
+    context: I64  # (B,) leading steps that precede the segment
+    values: F64  # (B,) the segment's composite reward; NaN for windows that only serve labelling
+    true_rewards: F32 | None = None  # (B, L), where the memory holds them: the oracle only
+
+
+@dataclass(slots=True)
+class _Episode:
+    number: int
+    start: int  # row of its first step
+    order: int  # episodes leave the memory in the order in which they came
+    steps: int = 0
+    ended: bool = False
+    scored: dict[int, int] = field(default_factory=dict)  # first step -> segment number
+
+
+class _Source:
+    """The steps of one source, in a ring: row r lies in slot r % capacity, rows only grow."""
+
+    def __init__(self, name: str, observation_size: int, action_size: int, capacity: int, true_rewards: bool) -> None:
+        self.name = name
+        self.capacity = capacity
+        # np.empty takes memory page by page as steps arrive, not at once
+        self.observations = np.empty((capacity, observation_size), np.float32)
+        self.actions = np.empty((capacity, action_size), np.float32)
+        self.labels = np.empty(capacity, np.float32)  # NaN: not labelled
+        self.versions = np.empty(capacity, np.uint32)
+        self.terminated = np.empty(capacity, np.bool_)
+        self.last = np.empty(capacity, np.bool_)  # last step so far of its episode: next observation is in `finals`
+        self.true_rewards = np.empty(capacity, np.float32) if true_rewards else None
+        self.finals: dict[int, F32] = {}
+        self.start = 0
+        self.end = 0
+        self.episodes: deque[_Episode] = deque()
+        self.newest: _Episode | None = None  # also where it has been evicted: the next steps follow on it
+        self.by_number: dict[int, _Episode] = {}
+        # segments, grown by doubling; number n lies at n - first_segment
+        self.first_segment = 0
+        self.segments = 0
+        self.segment_rows = np.empty(64, np.int64)
+        self.segment_lengths = np.empty(64, np.int64)
+        self.segment_offsets = np.empty(64, np.int64)  # first step within the episode
+        self.segment_episodes = np.empty(64, np.int64)
+        self.segment_values = np.empty(64, np.float64)
+        self.alive = np.empty(64, np.bool_)
+
+    @property
+    def steps(self) -> int:
+        return self.end - self.start
+
+    @property
+    def arrays(self) -> tuple[NDArray[np.generic], ...]:
+        rows: tuple[NDArray[np.generic], ...] = (
+            self.observations, self.actions, self.labels, self.versions, self.terminated, self.last,
+        )  # fmt: skip
+        return rows if self.true_rewards is None else (*rows, self.true_rewards)
+
+    def add_segment(self, row: int, length: int, offset: int, episode: int, value: float) -> int:
+        at = self.segments
+        for name in ('rows', 'lengths', 'offsets', 'episodes', 'values'):
+            self._grow(f'segment_{name}', at)
+        self._grow('alive', at)
+        self.segment_rows[at], self.segment_lengths[at], self.segment_offsets[at] = row, length, offset
+        self.segment_episodes[at], self.segment_values[at], self.alive[at] = episode, value, True
+        self.segments += 1
+        return self.first_segment + at
+
+    def _grow(self, name: str, needed: int) -> None:
+        array = getattr(self, name)
+        if needed >= len(array):
+            setattr(self, name, np.concatenate([array, np.empty_like(array)]))
+
+    def drop_segments(self, episode: _Episode) -> None:
+        for number in episode.scored.values():
+            self.alive[number - self.first_segment] = False
+        dead = int(np.argmax(self.alive[: self.segments])) if self.alive[: self.segments].any() else self.segments
+        if dead > self.segments // 2 and dead >= 64:
+            for name in ('rows', 'lengths', 'offsets', 'episodes', 'values'):
+                array = getattr(self, f'segment_{name}')
+                array[: self.segments - dead] = array[dead : self.segments].copy()
+            self.alive[: self.segments - dead] = self.alive[dead : self.segments].copy()
+            self.first_segment += dead
+            self.segments -= dead
+
+
+class Trajectories:
+    """What has been simulated, scored and labelled, bounded by a number of steps.
+
+    Args:
+        observation_size: O.
+        action_size: A.
+        delay: steps n of a segment.
+        capacity: steps after which `evict` drops the oldest episodes.
+        margin: steps that may be held beyond the capacity before `evict` is called: a phase and an episode.
+        true_rewards: keep the environment's own rewards too, for the oracle.
+    """
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_size: int,
+        delay: int,
+        capacity: int,
+        margin: int,
+        true_rewards: bool = False,
+    ) -> None:
+        self.observation_size = observation_size
+        self.action_size = action_size
+        self.delay = delay
+        self.capacity = capacity
+        self.evicted = 0
+        self._margin = margin
+        self._true_rewards = true_rewards
+        self._sources: dict[str, _Source] = {}
+        self._order = 0
+        self._sampleable: tuple[NDArray[np.int64], list[_Source]] | None = None
+        self._ids: I64 | None = None
+
+    # ------------------------------------------------------------------------------------------ adding
+
+    def append(self, chunk: Transitions) -> None:
+        """Add consecutive steps that go on where their source's last ones ended.
+
+        Raises:
+            RecordError: they do not follow on what is here.
+        """
+        source = self._sources.get(chunk.source)
+        if source is None:
+            source = _Source(
+                chunk.source, self.observation_size, self.action_size, self.capacity + self._margin, self._true_rewards
+            )
+            self._sources[chunk.source] = source
+        if source.steps + chunk.steps > source.capacity:
+            raise RecordError(
+                f'{chunk.steps} steps of {chunk.source!r} exceed the memory: {source.steps} of {source.capacity} rows are '
+                f'taken. Raise memory_steps ({self.capacity})'
+            )
+        episode = self._episode_of(source, chunk)
+        rows = np.arange(source.end, source.end + chunk.steps) % source.capacity
+        source.observations[rows] = chunk.observations[:-1]
+        source.actions[rows] = chunk.actions
+        source.labels[rows] = np.nan
+        source.versions[rows] = 0
+        source.terminated[rows] = False
+        source.last[rows] = False
+        if episode.steps:
+            del source.finals[source.end - 1]
+            source.last[(source.end - 1) % source.capacity] = False
+        source.end += chunk.steps
+        episode.steps += chunk.steps
+        episode.ended = chunk.terminated or chunk.truncated
+        source.finals[source.end - 1] = chunk.observations[-1].copy()
+        source.last[rows[-1]] = True
+        source.terminated[rows[-1]] = chunk.terminated
+        self._sampleable = None
+
+    def _episode_of(self, source: _Source, chunk: Transitions) -> _Episode:
+        last = source.newest
+        expected = (0, 0)
+        if last is not None:
+            expected = (last.number + 1, 0) if last.ended else (last.number, last.steps)
+        if (chunk.episode, chunk.first_step) != expected:
+            raise RecordError(
+                f'transitions out of sequence: {chunk.source!r} sent episode {chunk.episode} step {chunk.first_step} '
+                f'(sequence {chunk.sequence}); episode {expected[0]} step {expected[1]} follows on what is here. '
+                f'Restart the source, or send what lies between'
+            )
+        if last is not None and not last.ended:
+            if not np.array_equal(source.finals[source.end - 1], chunk.observations[0]):
+                raise RecordError(
+                    f'transitions of {chunk.source!r}, episode {chunk.episode}, step {chunk.first_step}: the first '
+                    f'observation is not the one that the steps before ended with'
+                )
+            return last
+        episode = _Episode(chunk.episode, source.end, self._order)
+        self._order += 1
+        source.newest = episode
+        source.episodes.append(episode)
+        source.by_number[chunk.episode] = episode
+        return episode
+
+    def append_true_rewards(self, record: TrueRewards) -> None:
+        """Add the environment's own rewards of steps that are here: for the oracle, never in a node."""
+        source = self._sources[record.source]
+        assert source.true_rewards is not None, 'this memory was made without true rewards'
+        start = source.by_number[record.episode].start + record.first_step
+        source.true_rewards[np.arange(start, start + len(record.rewards)) % source.capacity] = record.rewards
+
+    def score(self, reward: CompositeReward) -> None:
+        """Add the composite reward of a segment whose steps are here.
+
+        Raises:
+            RecordError: there is no such segment, or it has its reward already.
+        """
+        named = (
+            f'composite reward {reward.value} of {reward.scorer!r} for {reward.source!r}, episode {reward.episode}, '
+            f'first_step {reward.first_step}, length {reward.length}'
+        )
+        source = self._sources.get(reward.source)
+        episode = source.by_number.get(reward.episode) if source else None
+        if source is None or episode is None:
+            raise RecordError(f'{named}: no such episode is here (never sent, or evicted); score segments of steps sent')
+        last = reward.first_step + reward.length
+        whole = reward.length == self.delay
+        cut_short = episode.ended and last == episode.steps and 0 < reward.length < self.delay
+        if reward.first_step % self.delay or last > episode.steps or not (whole or cut_short):
+            raise RecordError(
+                f'{named}: there is no such segment. Segments have {self.delay} steps, start at multiples of '
+                f'{self.delay} and only the last of an ended episode is shorter; this episode has {episode.steps} steps'
+                f'{" and ended" if episode.ended else ""}'
+            )
+        if reward.first_step in episode.scored:
+            raise RecordError(f'{named}: the segment has its composite reward already; the first one is kept')
+        episode.scored[reward.first_step] = source.add_segment(
+            episode.start + reward.first_step, reward.length, reward.first_step, reward.episode, reward.value
+        )
+        self._ids = None
+
+    def evict(self) -> int:
+        """Drop whole episodes, oldest first, until at most `capacity` steps are held; how many steps went.
+
+        The last episode of all is kept however long it is: an empty memory teaches nothing.
+        """
+        gone = 0
+        while self.steps > self.capacity and sum(len(s.episodes) for s in self._sources.values()) > 1:
+            ended = [s for s in self._sources.values() if s.episodes and s.episodes[0].ended]
+            if not ended:
+                break  # unfinished episodes are all there is: they must not be cut
+            source = min(ended, key=lambda s: s.episodes[0].order)
+            episode = source.episodes.popleft()
+            del source.by_number[episode.number]
+            rows = np.arange(episode.start, episode.start + episode.steps)
+            source.labels[rows % source.capacity] = np.nan
+            del source.finals[int(rows[-1])]
+            source.drop_segments(episode)
+            source.start = episode.start + episode.steps
+            gone += episode.steps
+        self._ids = self._sampleable = None
+        self.evicted += gone
+        return gone
+
+    def apply(self, rewards: StepRewards) -> int:
+        """Store labels; how many of them belong to episodes that are gone and were passed over.
+
+        Raises:
+            RecordError: a label is for steps that are not here; nothing is stored then.
+        """
+        if len(rewards.lengths) == 0:
+            return 0
+        source = self._sources.get(rewards.source)
+        if source is None:
+            raise RecordError(f'step rewards for {rewards.source!r}, which sent no steps; sources: {list(self._sources)}')
+        starts = np.empty(len(rewards.lengths), np.int64)
+        newest = source.newest.number if source.newest else -1
+        known = source.by_number
+        gone = np.zeros(len(starts), np.bool_)
+        triples = zip(rewards.episodes.tolist(), rewards.first_steps.tolist(), rewards.lengths.tolist(), strict=True)
+        for i, (number, first, length) in enumerate(triples):
+            episode = known.get(number)
+            if episode is None and number <= newest:
+                gone[i] = True
+                starts[i] = 0
+            elif episode is None or first + length > episode.steps:
+                raise RecordError(
+                    f'step rewards of phase {rewards.phase} for {rewards.source!r}, episode {number}, first_step {first}, '
+                    f'length {length}: these steps are not here'
+                )
+            else:
+                starts[i] = episode.start + first
+        rows = _ranges(starts, rewards.lengths.astype(np.int64))
+        keep = np.repeat(~gone, rewards.lengths)
+        rows = rows[keep] % source.capacity
+        source.labels[rows] = rewards.labels[keep]
+        source.versions[rows] = rewards.version
+        self._sampleable = None
+        return int(np.count_nonzero(~keep))
+
+    # ------------------------------------------------------------------------------------------ asking
+
+    @property
+    def steps(self) -> int:
+        """Steps held."""
+        return sum(s.steps for s in self._sources.values())
+
+    @property
+    def labelled_steps(self) -> int:
+        """Steps that have a step reward."""
+        return len(self._labelled()[0])
+
+    @property
+    def bytes_per_step(self) -> int:
+        """Bytes that one stored step takes: observation, action, label, its model version, two flags."""
+        per_row = 4 * self.observation_size + 4 * self.action_size + 4 + 4 + 1 + 1
+        return per_row + (4 if self._true_rewards else 0)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the rows in use, with each episode's final observation and the table of segments."""
+        total = 0
+        for s in self._sources.values():
+            total += min(s.end, s.capacity) * self.bytes_per_step
+            total += len(s.finals) * 4 * self.observation_size + s.segments * 41
+        return total
+
+    def report(self) -> dict[str, int]:
+        """What is held and what it takes, for a run's summary."""
+        return {
+            'steps': self.steps,
+            'evicted': self.evicted,
+            'bytes_per_step': self.bytes_per_step,
+            'bytes': self.nbytes,
+        }
+
+    def labels(self) -> dict[str, F32]:
+        """The labels of each source's steps, in order; NaN where there is none."""
+        return {s.name: s.labels[np.arange(s.start, s.end) % s.capacity] for s in self._sources.values()}
+
+    def sample_steps(self, rng: np.random.Generator, batch: int) -> StepBatch:
+        """Draw labelled steps uniformly, with replacement.
+
+        Raises:
+            ValueError: no step is labelled.
+        """
+        slots, sources = self._labelled()
+        if not len(slots):
+            raise ValueError('no step of the memory is labelled: nothing to sample')
+        drawn = slots[rng.integers(0, len(slots), batch)]
+        if len(sources) == 1:
+            return self._steps(sources[0], drawn)
+        width = self.capacity + self._margin
+        parts = np.empty((batch, self.observation_size), np.float32)
+        result = StepBatch(
+            parts,
+            np.empty((batch, self.action_size), np.float32),
+            np.empty(batch, np.float32),
+            np.empty_like(parts),
+            np.empty(batch, np.bool_),
+        )
+        for index, source in enumerate(sources):
+            mine = np.flatnonzero(drawn // width == index)
+            some = self._steps(source, drawn[mine] % width)
+            for name in StepBatch.__dataclass_fields__:
+                getattr(result, name)[mine] = getattr(some, name)
+        return result
+
+    def _labelled(self) -> tuple[NDArray[np.int64], list[_Source]]:
+        if self._sampleable is None:
+            sources = [self._sources[name] for name in sorted(self._sources)]
+            width = self.capacity + self._margin
+            parts = [
+                np.flatnonzero(np.isfinite(s.labels[: min(s.end, s.capacity)])) + i * width
+                for i, s in enumerate(sources)
+            ]
+            self._sampleable = (np.concatenate(parts) if parts else np.empty(0, np.int64), sources)
+        return self._sampleable
+
+    @staticmethod
+    def _steps(source: _Source, slots: NDArray[np.int64]) -> StepBatch:
+        following = source.observations[(slots + 1) % source.capacity]
+        for i in np.flatnonzero(source.last[slots]):
+            row = source.start + (int(slots[i]) - source.start) % source.capacity
+            following[i] = source.finals[row]
+        return StepBatch(
+            source.observations[slots],
+            source.actions[slots],
+            source.labels[slots],
+            following,
+            source.terminated[slots],
+        )
+
+    def segment_ids(self) -> I64:
+        """Ids of all scored segments, source by source in the order they were scored."""
+        if self._ids is None:
+            parts = [
+                (np.flatnonzero(s.alive[: s.segments]) + s.first_segment) | (i << _SOURCE_SHIFT)
+                for i, (_, s) in enumerate(sorted(self._sources.items()))
+            ]
+            self._ids = np.concatenate(parts) if parts else np.empty(0, np.int64)
+        return self._ids
+
+    def sample_segments(self, rng: np.random.Generator, batch: int, context: int = 0) -> SegmentBatch:
+        """Draw scored segments uniformly, with replacement.
+
+        Raises:
+            ValueError: no segment is scored.
+        """
+        ids = self.segment_ids()
+        if not len(ids):
+            raise ValueError('no segment of the memory is scored: nothing to sample')
+        return self.segment_batch(ids[rng.integers(0, len(ids), batch)], context)
+
+    def segment_batch(self, ids: I64, context: int = 0) -> SegmentBatch:
+        """Segments by id, each with up to `context` steps of its episode before it."""
+        rows, lengths, offsets, values = (np.empty(len(ids), d) for d in (np.int64, np.int64, np.int64, np.float64))
+        for _, source, mine, at in self._by_source(ids):
+            rows[mine], lengths[mine] = source.segment_rows[at], source.segment_lengths[at]
+            offsets[mine], values[mine] = source.segment_offsets[at], source.segment_values[at]
+        before = np.minimum(context, offsets)
+        return self._windows(ids, rows - before, lengths + before, before, values)
+
+    def windows(self, ids: I64, window: int, batch: int) -> Iterator[SegmentBatch]:
+        """For each step of the segments, in order, the last `window` steps of its episode that end with it.
+
+        `context` counts the steps of a window that precede the segment of its last step.
+        """
+        rows, owners, contexts, lengths = [], [], [], []
+        for segment, (row, length, offset) in zip(ids.tolist(), self._spans(ids).tolist(), strict=True):
+            steps = np.arange(length)
+            size = np.minimum(window, offset + steps + 1)
+            rows.append(row + steps + 1 - size)
+            lengths.append(size)
+            contexts.append(np.maximum(0, size - steps - 1))
+            owners.append(np.full(length, segment))
+        if not rows:
+            return
+        all_rows, all_owners = np.concatenate(rows), np.concatenate(owners)
+        all_contexts, all_lengths = np.concatenate(contexts), np.concatenate(lengths)
+        for i in range(0, len(all_rows), batch):
+            part = slice(i, i + batch)
+            nothing = np.full(len(all_rows[part]), np.nan)
+            yield self._windows(all_owners[part], all_rows[part], all_lengths[part], all_contexts[part], nothing)
+
+    def segments(self, ids: I64) -> list[tuple[str, I64, I64, I64]]:
+        """Where segments lie: for each source its name, and the episodes, first steps and lengths of its ids."""
+        return [
+            (source.name, source.segment_episodes[at], source.segment_offsets[at], source.segment_lengths[at])
+            for _, source, _, at in self._by_source(ids)
+        ]
+
+    def score_scale(self) -> float:
+        """Root mean square of the composite reward per step over all scored segments; 1 where that is 0."""
+        squares = [
+            (s.segment_values[: s.segments] / s.segment_lengths[: s.segments])[s.alive[: s.segments]] ** 2
+            for s in self._sources.values()
+        ]
+        values = np.concatenate(squares) if squares else np.empty(0)
+        scale = float(np.sqrt(values.mean())) if len(values) else 0.0
+        return scale if scale > 0 else 1.0
+
+    def observation_moments(self) -> tuple[F64, F64]:
+        """Mean and standard deviation of each observation component over all steps held, in float64."""
+        parts = [s.observations[np.arange(s.start, s.end) % s.capacity] for s in self._sources.values() if s.steps]
+        if not parts:
+            return np.zeros(self.observation_size), np.ones(self.observation_size)
+        rows = np.concatenate(parts).astype(np.float64)
+        return rows.mean(0), rows.std(0)
+
+    def _by_source(self, ids: I64) -> Iterator[tuple[int, _Source, NDArray[np.int64], I64]]:
+        names = sorted(self._sources)
+        for index in np.unique(ids >> _SOURCE_SHIFT).tolist():
+            source = self._sources[names[index]]
+            mine = np.flatnonzero(ids >> _SOURCE_SHIFT == index)
+            yield index, source, mine, (ids[mine] & ((1 << _SOURCE_SHIFT) - 1)) - source.first_segment
+
+    def _spans(self, ids: I64) -> I64:
+        spans = np.empty((len(ids), 3), np.int64)
+        for _, source, mine, at in self._by_source(ids):
+            spans[mine, 0], spans[mine, 1] = source.segment_rows[at], source.segment_lengths[at]
+            spans[mine, 2] = source.segment_offsets[at]
+        return spans
+
+    def _windows(self, ids: I64, rows: I64, lengths: I64, context: I64, values: F64) -> SegmentBatch:
+        steps = int(lengths.max())
+        grid = rows[:, None] + np.arange(steps + 1)  # (B, L+1)
+        inside = np.arange(steps + 1) <= lengths[:, None]
+        observations = np.zeros((len(ids), steps + 1, self.observation_size), np.float32)
+        actions = np.zeros((len(ids), steps, self.action_size), np.float32)
+        rewards = np.zeros((len(ids), steps), np.float32) if self._true_rewards else None
+        for _, source, mine, _ in self._by_source(ids):
+            slots = grid[mine] % source.capacity
+            some = source.observations[slots]
+            ends = rows[mine] + lengths[mine] - 1
+            for i in np.flatnonzero(source.last[ends % source.capacity]):
+                some[i, lengths[mine[i]]] = source.finals[int(ends[i])]
+            some[~inside[mine]] = 0
+            observations[mine] = some
+            taken = source.actions[slots[:, :-1]]
+            taken[~inside[mine][:, 1:]] = 0
+            actions[mine] = taken
+            if rewards is not None and source.true_rewards is not None:
+                known = source.true_rewards[slots[:, :-1]]
+                known[~inside[mine][:, 1:]] = 0
+                rewards[mine] = known
+        return SegmentBatch(observations, actions, lengths, context, values, rewards)
+
+
+def _ranges(starts: I64, lengths: I64) -> I64:
+    """Concatenate start, start + 1, ... of each (start, length)."""
+    offsets = np.repeat(starts - np.concatenate([[0], np.cumsum(lengths)[:-1]]), lengths)
+    return offsets + np.arange(int(lengths.sum()))

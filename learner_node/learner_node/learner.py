@@ -1,0 +1,28 @@
+"""`ros2 run learner_node learner`: makes the run, permits its phases, learns the policy from labelled steps."""
+
+import sys
+from typing import TYPE_CHECKING
+
+from codetr_ros.ros.signals import Stop
+
+if TYPE_CHECKING:
+    from codetr_ros.ros.node import MakeCore
+
+
+def load() -> 'MakeCore':
+    """Import the core and return what makes it."""
+    from codetr_ros.learners.core import Learner
+
+    return lambda run, settings, name, folder: Learner(run, settings, name, folder)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; the imports follow the signal handlers, since they take seconds."""
+    stop = Stop().install()
+    from codetr_ros.ros.node import run_node
+
+    return run_node('learner', 'learner', load, argv, stop)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,28 @@
+"""`ros2 run reward_node reward`: learns the reward model from composite rewards and labels steps."""
+
+import sys
+from typing import TYPE_CHECKING
+
+from codetr_ros.ros.signals import Stop
+
+if TYPE_CHECKING:
+    from codetr_ros.ros.node import MakeCore
+
+
+def load() -> 'MakeCore':
+    """Import the core and return what makes it."""
+    from codetr_ros.rewards.core import Labeller
+
+    return lambda run, settings, name, folder: Labeller(run, settings, name, folder)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; the imports follow the signal handlers, since they take seconds."""
+    stop = Stop().install()
+    from codetr_ros.ros.node import run_node
+
+    return run_node('reward', 'reward', load, argv, stop)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

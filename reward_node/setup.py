@@ -1,0 +1,20 @@
+from setuptools import find_packages, setup
+
+package_name = 'reward_node'
+
+setup(
+    name=package_name,
+    version='0.1.0',
+    description='Learns from composite rewards how much each step contributed.',
+    maintainer='The codetr_ros maintainers',
+    maintainer_email='maintainers@codetr-ros.example',
+    license='Apache-2.0',
+    packages=find_packages(exclude=['test']),
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),
+        (f'share/{package_name}', ['package.xml']),
+    ],
+    install_requires=['setuptools'],
+    zip_safe=True,
+    entry_points={'console_scripts': ['reward = reward_node.reward:main']},
+)

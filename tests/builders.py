@@ -1,0 +1,99 @@
+"""Records made by hand, for tests: small, valid, and easy to make wrong in one field."""
+
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+
+from codetr_ros.config import Settings, load
+from codetr_ros.records import (
+    PROTOCOL_VERSION,
+    Commit,
+    CompositeReward,
+    Policy,
+    RunSpec,
+    StepRewards,
+    TaskSpec,
+    Transitions,
+)
+
+O, A = 3, 2
+
+
+def tiny(**changes: Any) -> Settings:
+    """Settings of a run that takes seconds: `codetr__layers=2` sets codetr.layers."""
+    small = {
+        'steps': 1200,
+        'phase_steps': 200,
+        'warmup_steps': 400,
+        'delay': 7,
+        'evaluate_every': 400,
+        'evaluate_episodes': 2,
+        'memory_steps': 900,
+        'sac.hidden': (16, 16),
+        'sac.batch': 16,
+        'sac.burst': 30,
+        'codetr.layers': 1,
+        'codetr.heads': 2,
+        'codetr.embedding': 16,
+        'codetr.batch': 8,
+        'codetr.first_gradient_steps': 5,
+        'codetr.gradient_steps': 2,
+        'codetr.dropout': 0.1,  # so that equality covers the random masks too
+    }
+    return load('quick').changed(small | {name.replace('__', '.'): value for name, value in changes.items()})
+
+
+def run(settings: Settings | None = None, run_id: str = 'run') -> RunSpec:
+    return (settings or tiny()).run_spec(run_id)
+
+
+def task_spec(**changes: Any) -> TaskSpec:
+    spec = TaskSpec('run', PROTOCOL_VERSION, 'sim', 'a task', O, A, 1000, 0.05, 1.0)
+    return replace(spec, **changes)
+
+
+def transitions(**changes: Any) -> Transitions:
+    """Five steps of episode 0 unless changed; arrays fit `steps`."""
+    steps = changes.get('steps', 5)
+    rng = np.random.default_rng(0)
+    chunk = Transitions(
+        'run', 'sim', 0, 0, 0, 0, steps,
+        rng.normal(size=(steps + 1, O)).astype(np.float32),
+        rng.uniform(-1, 1, (steps, A)).astype(np.float32),
+        False, False, False, 0,
+    )  # fmt: skip
+    return replace(chunk, **changes)
+
+
+def score(**changes: Any) -> CompositeReward:
+    return replace(CompositeReward('run', 'sim', 'sim', 0, 0, 0, 7, 1.5), **changes)
+
+
+def commit(**changes: Any) -> Commit:
+    last = np.zeros(1, np.int64)
+    return replace(Commit('run', 0, ('sim',), last, ('sim',), last - 1, ()), **changes)
+
+
+def policy(**changes: Any) -> Policy:
+    """Permission for phase 0: 200 random steps of 'sim'."""
+    return replace(Policy('run', 0, -1, ('sim',), np.array([200], np.uint32), True, '', b''), **changes)
+
+
+def step_rewards(**changes: Any) -> StepRewards:
+    segment = [np.array([n], np.uint32) for n in (0, 0, 5)]
+    return replace(StepRewards('run', 0, 1, 0, 1, 'sim', *segment, np.arange(5, dtype=np.float32)), **changes)
+
+
+def same(a: Any, b: Any) -> bool:
+    """Whether two records are equal in every bit."""
+    if type(a) is not type(b):
+        return False
+    for f in fields(a):
+        x, y = getattr(a, f.name), getattr(b, f.name)
+        if isinstance(x, np.ndarray):
+            if x.dtype != y.dtype or x.shape != y.shape or x.tobytes() != y.tobytes():
+                return False
+        elif x != y:
+            return False
+    return True
