@@ -182,9 +182,8 @@ class Setup:
         for arguments in ([PIP], everything):
             code, output = self.call('packages', pip + arguments)
             if code:
-                if (
-                    code > 0
-                ):  # pip ended by itself and put everything back; otherwise it was killed half-way
+                if code > 0:
+                    # pip ended by itself and put everything back; else it was killed half-way
                     self.save({'identity': self.identity()})
                 raise SetupError(f'{tail(output)}\n\nset-up: {explain_pip(output)}')
 

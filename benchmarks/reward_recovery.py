@@ -1,16 +1,18 @@
-"""Are the inferred step rewards the true ones? Reward recovery on held-out episodes of HalfCheetah.
+"""Are the inferred step rewards the true ones? Reward recovery on held-out episodes of
+HalfCheetah.
 
     .venv/bin/python benchmarks/reward_recovery.py --out benchmarks/results/reward_recovery.csv
 
-The data is the replay of a true-reward run of 20 000 steps (small networks), so that it ranges from random to
-running. Four fifths of its episodes train each model on nothing but composite rewards of 25 steps; the last fifth,
-every fifth episode, is held out. For each composite reward and each variant of the model it gives
+The data is the replay of a true-reward run of 20 000 steps (small networks), so that it ranges
+from random to running. Four fifths of its episodes train each model on nothing but composite
+rewards of 25 steps; the last fifth, every fifth episode, is held out. For each composite reward
+and each variant of the model it gives
 
     composite_r2       R^2 of the predicted composite reward
     pearson, spearman  correlation of inferred and true step rewards
-    within_pearson     the same with each segment's mean removed from both: is credit right inside the segment?
-    within_spearman
-    weights_sd         standard deviation of the attention weights w (1 on average)
+    within_pearson     the same with each segment's mean removed from both: is credit right inside
+    the segment? within_spearman weights_sd         standard deviation of the attention weights w
+    (1 on average)
 
 over held-out steps. A high R^2 says little about the steps, which is why the others are here.
 Rows that are in the file already are not run again.
@@ -24,9 +26,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy import stats
-
-from codetr_ros import in_process
 from codetr_ros.composite import composite
 from codetr_ros.config import Settings, load
 from codetr_ros.records import CompositeReward, Record, Transitions, TrueRewards
@@ -34,6 +33,9 @@ from codetr_ros.rewards.codetr import Codetr
 from codetr_ros.rewards.method import segment_steps
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.trajectories import Trajectories
+from scipy import stats
+
+from codetr_ros import in_process
 
 DELAY = 25
 COMPOSITES = ('sum', 'sum_square', 'square_sum', 'max')
@@ -52,16 +54,32 @@ VARIANTS: dict[str, dict[str, object]] = {
     'context episode': {'codetr.context': 'episode', 'codetr.window': 50},
 }
 COLUMNS = (
-    'composite', 'variant', 'seed', 'gradient_steps', 'composite_r2', 'pearson', 'spearman', 'within_pearson',
-    'within_spearman', 'weights_sd', 'seconds', 'commit',
-)  # fmt: skip
+    'composite',
+    'variant',
+    'seed',
+    'gradient_steps',
+    'composite_r2',
+    'pearson',
+    'spearman',
+    'within_pearson',
+    'within_spearman',
+    'weights_sd',
+    'seconds',
+    'commit',
+)
 
 
 def replay(cache: Path, steps: int = 20_000) -> dict[str, np.ndarray]:
     """The true-reward run's steps: made once, kept in `cache`."""
     if not cache.is_file():
         settings = load('quick').changed(
-            {'task': 'HalfCheetah-v5', 'method': 'true', 'steps': steps, 'warmup_steps': 1000, 'evaluate_every': 5000}
+            {
+                'task': 'HalfCheetah-v5',
+                'method': 'true',
+                'steps': steps,
+                'warmup_steps': 1000,
+                'evaluate_every': 5000,
+            }
         )
         seen: list[Record] = []
         in_process.run(settings, 'replay', observe=seen.append)
@@ -83,7 +101,10 @@ def replay(cache: Path, steps: int = 20_000) -> dict[str, np.ndarray]:
 def memories(data: dict[str, np.ndarray], settings: Settings) -> tuple[Trajectories, Trajectories]:
     """Training and held-out episodes as memories D, scored with the settings' composite reward."""
     sizes = data['observations'].shape[1], data['actions'].shape[1]
-    made = [Trajectories(*sizes, DELAY, len(data['rewards']), 1000, true_rewards=True) for _ in range(2)]
+    made = [
+        Trajectories(*sizes, DELAY, len(data['rewards']), 1000, true_rewards=True)
+        for _ in range(2)
+    ]
     counts = [0, 0]
     for episode in range(len(data['finals'])):
         rows = np.flatnonzero(data['episodes'] == episode)
@@ -93,7 +114,21 @@ def memories(data: dict[str, np.ndarray], settings: Settings) -> tuple[Trajector
         observations = np.concatenate([data['observations'][rows], data['finals'][episode][None]])
         n = len(rows)
         memory.append(
-            Transitions('', 's', number, 0, number, 0, n, observations, data['actions'][rows], False, True, False, 0)
+            Transitions(
+                '',
+                's',
+                number,
+                0,
+                number,
+                0,
+                n,
+                observations,
+                data['actions'][rows],
+                False,
+                True,
+                False,
+                0,
+            )
         )
         true = data['rewards'][rows]
         memory.append_true_rewards(TrueRewards('', 's', number, 0, number, 0, true))
@@ -104,7 +139,9 @@ def memories(data: dict[str, np.ndarray], settings: Settings) -> tuple[Trajector
     return made[0], made[1]
 
 
-def measure(data: dict[str, np.ndarray], settings: Settings, gradient_steps: int) -> dict[str, float]:
+def measure(
+    data: dict[str, np.ndarray], settings: Settings, gradient_steps: int
+) -> dict[str, float]:
     """Fit on the training episodes, compare on the held-out ones."""
     train, held_out = memories(data, settings)
     method = Codetr(settings, train.observation_size, train.action_size)
@@ -122,7 +159,8 @@ def measure(data: dict[str, np.ndarray], settings: Settings, gradient_steps: int
     n = inside.sum(1, keepdims=True)
     centred = [(x - x.sum(1, keepdims=True) / n)[inside] for x in (labels, true)]
     return {
-        'composite_r2': 1 - (residual**2).sum() / ((batch.values - batch.values.mean()) ** 2).sum(),
+        'composite_r2': 1
+        - (residual**2).sum() / ((batch.values - batch.values.mean()) ** 2).sum(),
         'pearson': stats.pearsonr(labels[inside], true[inside]).statistic,
         'spearman': stats.spearmanr(labels[inside], true[inside]).statistic,
         'within_pearson': stats.pearsonr(*centred).statistic,
@@ -132,21 +170,30 @@ def measure(data: dict[str, np.ndarray], settings: Settings, gradient_steps: int
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument('--out', type=Path, default=Path('benchmarks/results/reward_recovery.csv'))
-    parser.add_argument('--cache', type=Path, default=Path('.venv/cache/reward_recovery_replay.npz'))
+    parser.add_argument(
+        '--cache', type=Path, default=Path('.venv/cache/reward_recovery_replay.npz')
+    )
     parser.add_argument('--composites', nargs='+', default=list(COMPOSITES), choices=COMPOSITES)
     parser.add_argument('--variants', nargs='+', default=list(VARIANTS), choices=list(VARIANTS))
     parser.add_argument('--seeds', nargs='+', type=int, default=[0, 1, 2])
     parser.add_argument('--gradient-steps', nargs='+', type=int, default=[400])
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    commit = subprocess.run(['git', 'rev-parse', '--short', 'HEAD'], capture_output=True, text=True).stdout.strip()
+    commit = subprocess.run(
+        ['git', 'rev-parse', '--short', 'HEAD'], capture_output=True, text=True, check=True
+    ).stdout.strip()
     data = replay(arguments.cache)
     done = set()
     if arguments.out.is_file():
         with arguments.out.open() as file:
-            done = {(r['composite'], r['variant'], r['seed'], r['gradient_steps']) for r in csv.DictReader(file)}
+            done = {
+                (r['composite'], r['variant'], r['seed'], r['gradient_steps'])
+                for r in csv.DictReader(file)
+            }
     else:
         arguments.out.write_text(','.join(COLUMNS) + '\n')
     for steps in arguments.gradient_steps:

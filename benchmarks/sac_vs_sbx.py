@@ -102,7 +102,7 @@ def run_sbx(seed: int, steps: int = STEPS, warmup: int = WARMUP) -> dict[str, An
     return {
         'evaluations': evaluations,
         'wall_s': time.monotonic() - started,
-        'updates': model._n_updates,
+        'updates': model._n_updates,  # noqa: SLF001
         'versions': {name: version(name) for name in packages},
     }
 

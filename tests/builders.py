@@ -4,7 +4,6 @@ from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
-
 from codetr_ros.config import Settings, load
 from codetr_ros.records import (
     PROTOCOL_VERSION,
@@ -17,7 +16,7 @@ from codetr_ros.records import (
     Transitions,
 )
 
-O, A = 3, 2
+OBSERVATION, ACTION = 3, 2
 
 
 def tiny(**changes: Any) -> Settings:
@@ -41,7 +40,9 @@ def tiny(**changes: Any) -> Settings:
         'codetr.gradient_steps': 2,
         'codetr.dropout': 0.1,  # so that equality covers the random masks too
     }
-    return load('quick').changed(small | {name.replace('__', '.'): value for name, value in changes.items()})
+    return load('quick').changed(
+        small | {name.replace('__', '.'): value for name, value in changes.items()}
+    )
 
 
 def run(settings: Settings | None = None, run_id: str = 'run') -> RunSpec:
@@ -49,7 +50,7 @@ def run(settings: Settings | None = None, run_id: str = 'run') -> RunSpec:
 
 
 def task_spec(**changes: Any) -> TaskSpec:
-    spec = TaskSpec('run', PROTOCOL_VERSION, 'sim', 'a task', O, A, 1000, 0.05, 1.0)
+    spec = TaskSpec('run', PROTOCOL_VERSION, 'sim', 'a task', OBSERVATION, ACTION, 1000, 0.05, 1.0)
     return replace(spec, **changes)
 
 
@@ -58,11 +59,20 @@ def transitions(**changes: Any) -> Transitions:
     steps = changes.get('steps', 5)
     rng = np.random.default_rng(0)
     chunk = Transitions(
-        'run', 'sim', 0, 0, 0, 0, steps,
-        rng.normal(size=(steps + 1, O)).astype(np.float32),
-        rng.uniform(-1, 1, (steps, A)).astype(np.float32),
-        False, False, False, 0,
-    )  # fmt: skip
+        'run',
+        'sim',
+        0,
+        0,
+        0,
+        0,
+        steps,
+        rng.normal(size=(steps + 1, OBSERVATION)).astype(np.float32),
+        rng.uniform(-1, 1, (steps, ACTION)).astype(np.float32),
+        False,
+        False,
+        False,
+        0,
+    )
     return replace(chunk, **changes)
 
 
@@ -77,12 +87,16 @@ def commit(**changes: Any) -> Commit:
 
 def policy(**changes: Any) -> Policy:
     """Permission for phase 0: 200 random steps of 'sim'."""
-    return replace(Policy('run', 0, -1, ('sim',), np.array([200], np.uint32), True, '', b''), **changes)
+    return replace(
+        Policy('run', 0, -1, ('sim',), np.array([200], np.uint32), True, '', b''), **changes
+    )
 
 
 def step_rewards(**changes: Any) -> StepRewards:
     segment = [np.array([n], np.uint32) for n in (0, 0, 5)]
-    return replace(StepRewards('run', 0, 1, 0, 1, 'sim', *segment, np.arange(5, dtype=np.float32)), **changes)
+    return replace(
+        StepRewards('run', 0, 1, 0, 1, 'sim', *segment, np.arange(5, dtype=np.float32)), **changes
+    )
 
 
 def same(a: Any, b: Any) -> bool:

@@ -160,9 +160,16 @@ def test_a_process_killed_while_saving_leaves_a_whole_checkpoint_behind(tmp_path
         assert left == [], 'the next save clears away what the killed one left'
 
 
+def refusal(path: Path) -> str | None:
+    try:
+        checkpoints.load(path)
+    except CheckpointError as error:
+        return str(error)
+    return None
+
+
 def test_every_flipped_byte_is_refused_or_harmless(tmp_path: Path) -> None:
     path = checkpoints.save(tmp_path, 'learner', 1, {'w': torch.ones(2)}, {'a': 1.5, 'b': 'text'})
-    good = checkpoints.load(path)
     for name in ('checkpoint.json', 'tensors.safetensors'):
         file = path / name
         original = file.read_bytes()
@@ -170,16 +177,15 @@ def test_every_flipped_byte_is_refused_or_harmless(tmp_path: Path) -> None:
             damaged = bytearray(original)
             damaged[i] ^= 0x01
             file.write_bytes(damaged)
-            try:
+            said = refusal(path)
+            if said is None:
+                assert name == 'checkpoint.json', f'byte {i} of the tensors may not change'
+                assert chr(original[i]).isspace(), 'nothing but white space may change'
                 tensors, meta = checkpoints.load(path)
-            except CheckpointError as error:
-                assert str(file) in str(error)
-                assert 'damaged' in str(error)
+                assert meta == {'a': 1.5, 'b': 'text'}
+                assert tensors['w'].tolist() == [1, 1]
             else:
-                assert name == 'checkpoint.json', 'only white space of the description may change'
-                assert chr(original[i]).isspace()
-                assert meta == good[1]
-                assert torch.equal(tensors['w'], good[0]['w'])
+                assert f'{file} is damaged' in said
         file.write_bytes(original)
 
 

@@ -1,11 +1,12 @@
-"""What the consumers refuse at the door, and that they take in exactly what a commit names, in order."""
+"""What the consumers refuse at the door, and that they take in exactly what a commit names, in
+order.
+"""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import A, O, commit, run, score, task_spec, tiny, transitions
-
+from builders import ACTION, OBSERVATION, commit, run, score, task_spec, tiny, transitions
 from codetr_ros.intake import Intake
 from codetr_ros.records import RecordError
 from codetr_ros.trajectories import Trajectories
@@ -23,7 +24,7 @@ def known(**changes) -> Intake:
 
 
 def memory() -> Trajectories:
-    return Trajectories(O, A, 7, 1000, 1000)
+    return Trajectories(OBSERVATION, ACTION, 7, 1000, 1000)
 
 
 def last(number: int) -> np.ndarray:
@@ -36,14 +37,20 @@ NAN = np.array([[0, 0, 0]] * 3 + [[0, np.nan, 0]] + [[0, 0, 0]] * 2, np.float32)
 @pytest.mark.parametrize(
     ('record', 'said'),
     [
-        (transitions(run_id='other'), r"is of run 'other', this is run 'run'.*namespace of its own"),
-        (transitions(observations=NAN), r'observations\[3, 1\] is nan: all values must be finite'),
-        (transitions(actions=np.full((5, A), np.inf, np.float32)), r'actions\[0, 0\] is inf'),
         (
-            transitions(observations=np.zeros((6, O + 1), np.float32)),
-            r"observations have shape \(6, 4\), \(6, 3\) expected of task a task as 'sim' announced",
+            transitions(run_id='other'),
+            r"is of run 'other', this is run 'run'.*namespace of its own",
         ),
-        (transitions(steps=5, actions=np.zeros((4, A), np.float32)), r'actions have shape \(4, 2\), \(5, 2\)'),
+        (transitions(observations=NAN), r'observations\[3, 1\] is nan: all values must be finite'),
+        (transitions(actions=np.full((5, ACTION), np.inf, np.float32)), r'actions\[0, 0\] is inf'),
+        (
+            transitions(observations=np.zeros((6, OBSERVATION + 1), np.float32)),
+            r"observations have shape \(6, 4\), \(6, 3\) expected of task a task as 'sim'",
+        ),
+        (
+            transitions(steps=5, actions=np.zeros((4, ACTION), np.float32)),
+            r'actions have shape \(4, 2\), \(5, 2\)',
+        ),
         (transitions(first_step=998), 'step 1003 lies beyond the horizon 1000'),
         (transitions(source='stranger'), "'stranger' is no simulator of this run; these are: sim"),
         (score(value=float('nan')), 'value is nan: a composite reward must be finite'),
@@ -51,7 +58,10 @@ NAN = np.array([[0, 0, 0]] * 3 + [[0, np.nan, 0]] + [[0, 0, 0]] * 2, np.float32)
         (score(length=0), 'length is 0'),
         (score(run_id='other'), "is of run 'other'"),
         (commit(run_id='other'), "is of run 'other'"),
-        (task_spec(source='second'), "'second' is one simulator too many: the run has simulators=1"),
+        (
+            task_spec(source='second'),
+            "'second' is one simulator too many: the run has simulators=1",
+        ),
         (task_spec(protocol_version=99), "'sim' speaks protocol 99, this node 1"),
         (task_spec(source='x', action_size=5), "'x' has action_size=5, 'sim' has 2"),
     ],

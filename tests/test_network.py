@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
-
 from codetr_ros.learners.network import (
     LOG_STD_RANGE,
     ActingPolicy,
@@ -19,13 +18,13 @@ from codetr_ros.learners.network import (
 )
 from codetr_ros.records import Policy
 
-O, A, HIDDEN = 7, 3, (32, 16)
+OBS, ACT, HIDDEN = 7, 3, (32, 16)
 
 
 @pytest.fixture
 def actor() -> Actor:
     torch.manual_seed(5)
-    actor = Actor(O, A, HIDDEN)
+    actor = Actor(OBS, ACT, HIDDEN)
     with torch.no_grad():
         for parameter in actor.parameters():
             parameter.add_(0.1 * torch.randn_like(parameter))  # biases too
@@ -40,7 +39,7 @@ def record(actor: Actor, **changes: object) -> Policy:
         sources=('sim',),
         steps=np.array([1000], np.uint32),
         random=False,
-        network=describe(O, A, HIDDEN),
+        network=describe(OBS, ACT, HIDDEN),
         weights=weights_bytes(actor),
     )
     return replace(policy, **changes)
@@ -53,27 +52,27 @@ def with_tensors(actor: Actor, **changes: torch.Tensor | None) -> Policy:
 
 
 def observations(count: int) -> np.ndarray:
-    return np.random.default_rng(0).standard_normal((count, O)).astype(np.float32)
+    return np.random.default_rng(0).standard_normal((count, OBS)).astype(np.float32)
 
 
 def test_the_acting_policy_acts_as_the_actor_that_was_published(actor: Actor) -> None:
-    policy = ActingPolicy.from_record(record(actor), O, A)
+    policy = ActingPolicy.from_record(record(actor), OBS, ACT)
     seen = observations(20)
-    noise = np.random.default_rng(1).standard_normal((20, A)).astype(np.float32)
+    noise = np.random.default_rng(1).standard_normal((20, ACT)).astype(np.float32)
     with torch.no_grad():
         mean, log_std = actor(torch.from_numpy(seen))
     sampled = torch.tanh(mean + log_std.exp() * torch.from_numpy(noise)).numpy()
     for i in range(20):
         action = policy.act(seen[i])
-        assert action.dtype == np.float32 and action.shape == (A,)
+        assert action.dtype == np.float32 and action.shape == (ACT,)
         np.testing.assert_allclose(action, torch.tanh(mean[i]).numpy(), atol=1e-6)
         np.testing.assert_allclose(policy.act(seen[i], noise[i]), sampled[i], atol=1e-6)
 
 
 def test_an_action_never_leaves_the_unit_box_however_large_the_noise(actor: Actor) -> None:
-    policy = ActingPolicy.from_record(record(actor), O, A)
+    policy = ActingPolicy.from_record(record(actor), OBS, ACT)
     for size in (-1e6, 1e6):
-        action = policy.act(observations(1)[0], np.full(A, size, np.float32))
+        action = policy.act(observations(1)[0], np.full(ACT, size, np.float32))
         assert np.all(np.abs(action) <= 1)
 
 
@@ -101,14 +100,14 @@ def test_what_the_learner_does_next_does_not_change_a_policy_made_before(actor: 
 
 
 def test_the_same_weights_give_the_same_bytes(actor: Actor) -> None:
-    again = Actor(O, A, HIDDEN)
+    again = Actor(OBS, ACT, HIDDEN)
     again.load_state_dict(actor.state_dict())
     assert weights_bytes(again) == weights_bytes(actor)
 
 
 def test_initial_weights_are_orthogonal_with_gain_one_in_each_head() -> None:
     torch.manual_seed(0)
-    actor = Actor(O, A, HIDDEN)
+    actor = Actor(OBS, ACT, HIDDEN)
     first, second, heads = linear_layers(actor)
     for layer, gain in ((first, 2), (second, 2), *((head, 1) for head in heads.weight.chunk(2))):
         weight = (layer if isinstance(layer, torch.Tensor) else layer.weight).detach()
@@ -119,8 +118,8 @@ def test_initial_weights_are_orthogonal_with_gain_one_in_each_head() -> None:
 
 def test_the_log_standard_deviation_is_clipped_on_both_sides(actor: Actor) -> None:
     with torch.no_grad():
-        actor.heads.bias[A] = 1e4
-        actor.heads.bias[A + 1] = -1e4
+        actor.heads.bias[ACT] = 1e4
+        actor.heads.bias[ACT + 1] = -1e4
         _, log_std = actor(torch.from_numpy(observations(4)))
     assert LOG_STD_RANGE == (-10, 2)
     assert torch.all(log_std[:, 0] == 2) and torch.all(log_std[:, 1] == -10)
@@ -132,42 +131,42 @@ def test_the_log_standard_deviation_is_clipped_on_both_sides(actor: Actor) -> No
 
 
 def test_the_description_is_canonical_json_that_names_sizes_and_widths() -> None:
-    description = describe(O, A, HIDDEN)
+    description = describe(OBS, ACT, HIDDEN)
     parsed = json.loads(description)
-    assert parsed['observation_size'] == O and parsed['action_size'] == A
+    assert parsed['observation_size'] == OBS and parsed['action_size'] == ACT
     assert parsed['hidden'] == list(HIDDEN)
     assert description == json.dumps(parsed, sort_keys=True, separators=(',', ':'))
-    assert len({describe(O, A, h) for h in (HIDDEN, HIDDEN[::-1], (32,), (32, 16, 16))}) == 4
+    assert len({describe(OBS, ACT, h) for h in (HIDDEN, HIDDEN[::-1], (32,), (32, 16, 16))}) == 4
 
 
 def test_a_policy_for_another_task_is_refused_and_both_architectures_are_named(
     actor: Actor,
 ) -> None:
     with pytest.raises(NetworkError) as refused:
-        ActingPolicy.from_record(record(actor), O + 1, A)
+        ActingPolicy.from_record(record(actor), OBS + 1, ACT)
     message = str(refused.value)
-    assert describe(O, A, HIDDEN) in message and describe(O + 1, A, HIDDEN) in message
+    assert describe(OBS, ACT, HIDDEN) in message and describe(OBS + 1, ACT, HIDDEN) in message
     assert 'policy of phase 12, version 11' in message
 
 
 def test_another_activation_is_another_architecture(actor: Actor) -> None:
-    other = describe(O, A, HIDDEN).replace('relu', 'tanh')
+    other = describe(OBS, ACT, HIDDEN).replace('relu', 'tanh')
     with pytest.raises(NetworkError, match='another architecture'):
-        ActingPolicy.from_record(record(actor, network=other), O, A)
+        ActingPolicy.from_record(record(actor, network=other), OBS, ACT)
 
 
 @pytest.mark.parametrize('network', ['', 'MLP', '[]', '{}', 'null'])
 def test_a_description_in_another_language_is_quoted(actor: Actor, network: str) -> None:
     with pytest.raises(NetworkError, match='not one of this version') as refused:
-        ActingPolicy.from_record(record(actor, network=network), O, A)
+        ActingPolicy.from_record(record(actor, network=network), OBS, ACT)
     assert repr(network) in str(refused.value)
 
 
 @pytest.mark.parametrize('hidden', ['[]', '[0]', '[10000000]', '[1.5]', '["8"]', '[true]', '256'])
 def test_impossible_widths_are_refused_before_a_network_is_made(actor: Actor, hidden: str) -> None:
-    network = describe(O, A, HIDDEN).replace('[32,16]', hidden)
+    network = describe(OBS, ACT, HIDDEN).replace('[32,16]', hidden)
     with pytest.raises(NetworkError, match='names hidden widths'):
-        ActingPolicy.from_record(record(actor, network=network), O, A)
+        ActingPolicy.from_record(record(actor, network=network), OBS, ACT)
 
 
 @pytest.mark.parametrize(
@@ -175,8 +174,8 @@ def test_impossible_widths_are_refused_before_a_network_is_made(actor: Actor, hi
     [
         ({'heads.bias': None}, "missing weights \\['heads.bias'\\], unknown weights \\[\\]"),
         ({'more': torch.zeros(1)}, "missing weights \\[\\], unknown weights \\['more'\\]"),
-        ({'heads.bias': torch.zeros(A)}, r"'heads.bias' is .*\(3,\).*, expected .*\(6,\)"),
-        ({'heads.bias': torch.zeros(2 * A).double()}, "is .*float64.*, expected .*float32'"),
+        ({'heads.bias': torch.zeros(ACT)}, r"'heads.bias' is .*\(3,\).*, expected .*\(6,\)"),
+        ({'heads.bias': torch.zeros(2 * ACT).double()}, "is .*float64.*, expected .*float32'"),
         ({'heads.bias': torch.tensor([0.0] * 5 + [torch.nan])}, '1 of 6 numbers .*heads.bias'),
         ({'heads.bias': torch.tensor([0.0] * 4 + [torch.inf] * 2)}, '2 of 6 numbers .*not finite'),
     ],
@@ -185,16 +184,16 @@ def test_weights_that_do_not_fit_are_refused(
     actor: Actor, changes: dict[str, torch.Tensor | None], said: str
 ) -> None:
     with pytest.raises(NetworkError, match=said):
-        ActingPolicy.from_record(with_tensors(actor, **changes), O, A)
+        ActingPolicy.from_record(with_tensors(actor, **changes), OBS, ACT)
 
 
 @pytest.mark.parametrize('keep', [0, 7, 100, -1])
 def test_weights_that_are_cut_short_are_refused(actor: Actor, keep: int) -> None:
     cut = weights_bytes(actor)[:keep]
     with pytest.raises(NetworkError, match=f'its {len(cut)} bytes of weights are not safetensors'):
-        ActingPolicy.from_record(record(actor, weights=cut), O, A)
+        ActingPolicy.from_record(record(actor, weights=cut), OBS, ACT)
 
 
 def test_a_random_policy_has_nothing_to_act_with(actor: Actor) -> None:
     with pytest.raises(NetworkError, match='is random'):
-        ActingPolicy.from_record(record(actor, random=True, weights=b''), O, A)
+        ActingPolicy.from_record(record(actor, random=True, weights=b''), OBS, ACT)

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from builders import policy, run, score, task_spec, tiny, transitions
-
 from codetr_ros.recorder import Recorder
 from codetr_ros.records import Commit, RecordError
 
@@ -29,7 +28,9 @@ def test_a_phase_is_committed_only_with_all_its_steps_and_all_due_scores():
     r.receive(policy())
     assert commits(r, work) == []
     r.receive(transitions(sequence=1, first_step=199, steps=1, phase_end=True, scores_due=2))
-    assert commits(r, work) == [] and r.waiting_for() == "phase 0 lacks 2 composite rewards of 'sim'"
+    assert (
+        commits(r, work) == [] and r.waiting_for() == "phase 0 lacks 2 composite rewards of 'sim'"
+    )
     r.receive(score())
     assert commits(r, work) == []
     r.receive(score(sequence=1, first_step=7))
@@ -48,7 +49,9 @@ def test_scores_of_the_next_phase_that_came_early_are_left_to_it():
     r.receive(score(sequence=1, first_step=7))
     (made,) = commits(r, work)
     assert made.scores.tolist() == [0]
-    r.receive(transitions(sequence=1, phase=1, first_step=200, steps=200, phase_end=True, scores_due=1))
+    r.receive(
+        transitions(sequence=1, phase=1, first_step=200, steps=200, phase_end=True, scores_due=1)
+    )
     (made,) = commits(r, work)
     assert (made.phase, made.scores.tolist()) == (1, [1])
 
@@ -56,7 +59,9 @@ def test_scores_of_the_next_phase_that_came_early_are_left_to_it():
 def test_what_is_out_of_sequence_is_refused_naming_what_is_due():
     r = recorder()
     r.receive(transitions())
-    with pytest.raises(RecordError, match=r"sequence=2.* is out of sequence: 1 is the next of 'sim'"):
+    with pytest.raises(
+        RecordError, match=r"sequence=2.* is out of sequence: 1 is the next of 'sim'"
+    ):
         r.receive(transitions(sequence=2, first_step=5))
     with pytest.raises(RecordError, match='out of sequence: 0 is the next'):
         r.receive(score(sequence=3))
@@ -86,7 +91,10 @@ def test_steps_of_another_run_or_source_or_with_nan_are_refused():
     for wrong, said in (
         (transitions(run_id='other'), "of run 'other'"),
         (transitions(source='stranger'), 'no simulator of this run'),
-        (transitions(observations=np.full((6, 3), np.nan, np.float32)), r'observations\[0, 0\] is nan'),
+        (
+            transitions(observations=np.full((6, 3), np.nan, np.float32)),
+            r'observations\[0, 0\] is nan',
+        ),
     ):
         with pytest.raises(RecordError, match=said):
             r.receive(wrong)

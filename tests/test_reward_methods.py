@@ -18,6 +18,14 @@ O, A, DELAY = builders.O, builders.A, 7
 LENGTHS = (24, 14, 3)  # a short last segment, none, and an episode shorter than a segment
 
 
+@pytest.fixture(autouse=True)
+def one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
 def filled(true_rewards: bool = True) -> Trajectories:
     memory = Trajectories(O, A, DELAY, 1000, 100, true_rewards)
     rng = np.random.default_rng(1)
@@ -25,15 +33,25 @@ def filled(true_rewards: bool = True) -> Trajectories:
         observations = rng.normal(size=(steps + 1, O)).astype(np.float32)
         memory.append(
             builders.transitions(
-                steps=steps, sequence=episode, episode=episode, observations=observations, truncated=True
+                steps=steps,
+                sequence=episode,
+                episode=episode,
+                observations=observations,
+                truncated=True,
             )
         )
         step_rewards = rng.normal(2.0, 1.0, steps).astype(np.float32)
         if true_rewards:
-            memory.append_true_rewards(TrueRewards('run', 'sim', episode, 0, episode, 0, step_rewards))
+            memory.append_true_rewards(
+                TrueRewards('run', 'sim', episode, 0, episode, 0, step_rewards)
+            )
         for first in range(0, steps, DELAY):
             part = step_rewards[first : first + DELAY]
-            memory.score(CompositeReward('run', 'sim', 'sim', first, episode, first, len(part), float(part.sum())))
+            memory.score(
+                CompositeReward(
+                    'run', 'sim', 'sim', first, episode, first, len(part), float(part.sum())
+                )
+            )
     return memory
 
 
@@ -146,13 +164,18 @@ class Contract:
             state['target_scale'] = torch.tensor(float('nan'), dtype=torch.float64)
         before = made.state()
         name = 'network.other' if damage == 'unknown' else 'target_scale'
-        with pytest.raises(RewardModelError, match=f"'{self.method}' refused: {name} .*use those it was saved with"):
+        with pytest.raises(
+            RewardModelError,
+            match=f"'{self.method}' refused: {name} .*use those it was saved with",
+        ):
             made.load_state(state)
         assert equal(made.state(), before)
 
     def test_asked_before_it_was_prepared_it_says_what_to_do(self):
         memory, made = filled(), self.make()
-        with pytest.raises(RewardModelError, match=f"'{self.method}' has no target scale yet: call prepare"):
+        with pytest.raises(
+            RewardModelError, match=f"'{self.method}' has no target scale yet: call prepare"
+        ):
             made.label(batch_of(memory, made))
 
     def test_raw_labels_are_the_scaled_ones_times_the_target_scale(self):
@@ -215,7 +238,11 @@ class TestCodetrAsInThePaper(TestCodetr):
 
 
 class TestCodetrWithContext(TestCodetr):
-    changes = {'codetr__context': 'episode', 'codetr__attention_scope': 'window', 'codetr__window': 10}  # noqa: RUF012
+    changes = {
+        'codetr__context': 'episode',
+        'codetr__attention_scope': 'window',
+        'codetr__window': 10,
+    }  # noqa: RUF012
 
 
 class TestCodetrOfRewardsAlone(TestCodetr):
@@ -237,7 +264,9 @@ class Rule(Contract):
         for labels, length, value, true in zip(
             made.label(batch), batch.lengths, batch.values, batch.true_rewards, strict=True
         ):
-            np.testing.assert_allclose(labels[:length], self.expected(value, true[:length]), rtol=1e-6)
+            np.testing.assert_allclose(
+                labels[:length], self.expected(value, true[:length]), rtol=1e-6
+            )
 
     def test_windows_are_refused(self):
         memory = filled()
@@ -272,7 +301,9 @@ class TestTrueReward(Rule):
 
     def test_a_memory_that_does_not_hold_the_truth_is_refused(self):
         memory = filled(true_rewards=False)
-        with pytest.raises(RewardModelError, match='no true_rewards; make the memory with true_rewards=True'):
+        with pytest.raises(
+            RewardModelError, match='no true_rewards; make the memory with true_rewards=True'
+        ):
             self.trained(memory).label(memory.segment_batch(memory.segment_ids()))
 
 
@@ -286,7 +317,9 @@ class TestOnes(Rule):
 
 def test_a_method_that_does_not_exist_is_refused_by_name():
     unchecked = builders.tiny().model_copy(update={'method': 'magic'})
-    with pytest.raises(RewardModelError, match="method = 'magic'.*choose one of codetr, none, uniform, true, ones"):
+    with pytest.raises(
+        RewardModelError, match="method = 'magic'.*choose one of codetr, none, uniform, true, ones"
+    ):
         rewards.make(unchecked, O, A)
 
 

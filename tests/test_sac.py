@@ -1,4 +1,4 @@
-"""Soft actor-critic, held against a plain re-statement of the textbook and against known values."""
+"""The policy learner, held against a plain re-statement of the textbook and known values."""
 
 from collections.abc import Iterator
 
@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
-from torch import nn
-
 from codetr_ros.config import SacSettings
 from codetr_ros.learners.sac import SAC, SacError, q_values, squashed_gaussian
 from codetr_ros.trajectories import StepBatch
+from torch import nn
 
-O, A, B = 5, 3, 32
+torch.set_num_threads(1)  # a second thread is slower at these sizes
+
+OBS, ACT, B = 5, 3, 32
 SETTINGS = SacSettings(
     hidden=(24, 16),
     batch=B,
@@ -36,10 +37,10 @@ def double() -> Iterator[None]:
 def make_batch(seed: int, dtype: type = np.float32) -> StepBatch:
     rng = np.random.default_rng(seed)
     return StepBatch(
-        observations=rng.standard_normal((B, O)).astype(dtype),
-        actions=rng.uniform(-1, 1, (B, A)).astype(dtype),
+        observations=rng.standard_normal((B, OBS)).astype(dtype),
+        actions=rng.uniform(-1, 1, (B, ACT)).astype(dtype),
         rewards=rng.standard_normal(B).astype(dtype),
-        next_observations=rng.standard_normal((B, O)).astype(dtype),
+        next_observations=rng.standard_normal((B, OBS)).astype(dtype),
         terminated=rng.random(B) < 0.3,
     )
 
@@ -58,7 +59,9 @@ class Plain:
 
     def __init__(self, sac: SAC) -> None:
         state = sac.state()
-        self.policy = nn.ModuleList([nn.Linear(O, 24), nn.Linear(24, 16), nn.Linear(16, 2 * A)])
+        self.policy = nn.ModuleList(
+            [nn.Linear(OBS, 24), nn.Linear(24, 16), nn.Linear(16, 2 * ACT)]
+        )
         for i, name in enumerate(('body.0', 'body.2', 'heads')):
             self.policy[i].weight.data = state[f'actor.{name}.weight']
             self.policy[i].bias.data = state[f'actor.{name}.bias']
@@ -72,7 +75,7 @@ class Plain:
 
     @staticmethod
     def critic(state: dict[str, torch.Tensor], name: str, index: int) -> nn.Sequential:
-        layers = [nn.Linear(O + A, 24), nn.Linear(24, 16), nn.Linear(16, 1)]
+        layers = [nn.Linear(OBS + ACT, 24), nn.Linear(24, 16), nn.Linear(16, 1)]
         for i, layer in enumerate(layers):
             layer.weight.data = state[f'{name}.{2 * i}'][index].T.clone()
             layer.bias.data = state[f'{name}.{2 * i + 1}'][index, 0].clone()
@@ -81,7 +84,7 @@ class Plain:
     def act(self, s: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         x = self.policy[1](self.policy[0](s).relu()).relu()
         out = self.policy[2](x)
-        normal = torch.distributions.Normal(out[:, :A], out[:, A:].clamp(-10, 2).exp())
+        normal = torch.distributions.Normal(out[:, :ACT], out[:, ACT:].clamp(-10, 2).exp())
         u = normal.mean + normal.stddev * noise
         a = torch.tanh(u)
         return a, (normal.log_prob(u) - torch.log(1 - a**2)).sum(1)
@@ -93,7 +96,7 @@ class Plain:
             (batch.observations, batch.actions, batch.rewards, batch.next_observations),
         )
         torch.manual_seed(1000 + index)
-        noises = torch.randn(2, B, A)
+        noises = torch.randn(2, B, ACT)
         alpha = self.log_alpha.exp().item()
         with torch.no_grad():
             a2, log_prob2 = self.act(s2, noises[0])
@@ -117,7 +120,7 @@ class Plain:
         actor_loss.backward()
         self.actor_adam.step()
         entropy = -log_prob.mean().detach()
-        alpha_loss = self.log_alpha.exp() * (entropy - (-0.5 * A))
+        alpha_loss = self.log_alpha.exp() * (entropy - (-0.5 * ACT))
         self.alpha_adam.zero_grad()
         alpha_loss.backward()
         self.alpha_adam.step()
@@ -143,7 +146,7 @@ class Plain:
 
 
 def test_updates_are_those_of_a_plain_restatement(double: None) -> None:
-    sac = SAC(O, A, SETTINGS, seed=3)
+    sac = SAC(OBS, ACT, SETTINGS, seed=3)
     plain = Plain(sac)
     for index in range(6):
         metrics, expected = update(sac, index, np.float64), plain.update(index)
@@ -155,14 +158,14 @@ def test_updates_are_those_of_a_plain_restatement(double: None) -> None:
 
 def test_log_probabilities_agree_with_a_numeric_jacobian_of_the_squash() -> None:
     generator = torch.Generator().manual_seed(0)
-    mean, log_std, noise = torch.randn(3, 40, A, generator=generator, dtype=torch.float64)
+    mean, log_std, noise = torch.randn(3, 40, ACT, generator=generator, dtype=torch.float64)
     actions, log_prob = squashed_gaussian((mean, log_std), noise)
     u = mean + log_std.exp() * noise
     step = 1e-6
     for row in range(40):
-        jacobian = np.empty((A, A))
-        for column in range(A):
-            shift = step * torch.eye(A, dtype=torch.float64)[column]
+        jacobian = np.empty((ACT, ACT))
+        for column in range(ACT):
+            shift = step * torch.eye(ACT, dtype=torch.float64)[column]
             difference = torch.tanh(u[row] + shift) - torch.tanh(u[row] - shift)
             jacobian[:, column] = difference / (2 * step)
         density = torch.distributions.MultivariateNormal(
@@ -213,18 +216,18 @@ def test_a_terminal_step_is_worth_its_reward_and_a_truncated_one_all_that_would_
 def test_the_temperature_moves_the_entropy_towards_its_target(
     target: float, direction: int
 ) -> None:
-    sac = SAC(O, A, SETTINGS.model_copy(update={'target_entropy': target}), seed=0)
+    sac = SAC(OBS, ACT, SETTINGS.model_copy(update={'target_entropy': target}), seed=0)
     temperatures = [float(update(sac, index)['temperature']) for index in range(5)]
     assert temperatures[0] == pytest.approx(0.5)
     assert np.all(np.sign(np.diff(temperatures)) == direction)
 
 
 def test_the_target_entropy_is_minus_half_the_action_size_as_in_jaxrl() -> None:
-    assert SAC(O, A, SacSettings(hidden=(8,)), seed=0).target_entropy == -A / 2
+    assert SAC(OBS, ACT, SacSettings(hidden=(8,)), seed=0).target_entropy == -ACT / 2
 
 
 def test_both_critics_start_orthogonal_up_to_their_output_and_different() -> None:
-    sac = SAC(O, A, SETTINGS, seed=0)
+    sac = SAC(OBS, ACT, SETTINGS, seed=0)
     for weight, bias in zip(sac.critic_values[::2], sac.critic_values[1::2], strict=True):
         assert not torch.equal(weight[0], weight[1])
         assert not bias.any()
@@ -235,7 +238,7 @@ def test_both_critics_start_orthogonal_up_to_their_output_and_different() -> Non
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not() -> None:
-    one, other, third = (SAC(O, A, SETTINGS, seed) for seed in (4, 4, 5))
+    one, other, third = (SAC(OBS, ACT, SETTINGS, seed) for seed in (4, 4, 5))
     assert same(one.state(), other.state())
     assert not same(one.state(), third.state())
     for index in range(3):
@@ -244,10 +247,10 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not() -> None:
 
 
 def test_where_a_batch_lies_in_memory_does_not_change_a_bit() -> None:
-    one, other = SAC(O, A, SETTINGS, 4), SAC(O, A, SETTINGS, 4)
+    one, other = SAC(OBS, ACT, SETTINGS, 4), SAC(OBS, ACT, SETTINGS, 4)
     batch = make_batch(0)
     crooked = np.empty(batch.observations.nbytes + 64, np.uint8)[1:][: batch.observations.nbytes]
-    observations = crooked.view(np.float32).reshape(B, O)
+    observations = crooked.view(np.float32).reshape(B, OBS)
     observations[:] = batch.observations
     moved = StepBatch(
         observations, batch.actions, batch.rewards, batch.next_observations, batch.terminated
@@ -259,11 +262,11 @@ def test_where_a_batch_lies_in_memory_does_not_change_a_bit() -> None:
 
 
 def test_a_saved_learner_goes_on_bit_for_bit() -> None:
-    sac = SAC(O, A, SETTINGS, seed=0)
+    sac = SAC(OBS, ACT, SETTINGS, seed=0)
     for index in range(3):
         update(sac, index)
     saved = safetensors.torch.save(sac.state())
-    loaded = SAC(O, A, SETTINGS, seed=99)
+    loaded = SAC(OBS, ACT, SETTINGS, seed=99)
     loaded.load_state(safetensors.torch.load(saved))
     for index in range(3, 6):
         assert same(update(sac, index), update(loaded, index))
@@ -271,7 +274,7 @@ def test_a_saved_learner_goes_on_bit_for_bit() -> None:
 
 
 def test_a_state_is_a_copy_that_later_updates_leave_alone() -> None:
-    sac = SAC(O, A, SETTINGS, seed=0)
+    sac = SAC(OBS, ACT, SETTINGS, seed=0)
     state = sac.state()
     before = {name: tensor.clone() for name, tensor in state.items()}
     update(sac, 0)
@@ -283,12 +286,12 @@ def test_a_state_is_a_copy_that_later_updates_leave_alone() -> None:
 
 
 def test_a_state_of_other_settings_is_refused_and_changes_nothing() -> None:
-    sac = SAC(O, A, SETTINGS, seed=0)
+    sac = SAC(OBS, ACT, SETTINGS, seed=0)
     before = sac.state()
-    deeper = SAC(O, A, SETTINGS.model_copy(update={'hidden': (24, 16, 16)}), seed=1).state()
+    deeper = SAC(OBS, ACT, SETTINGS.model_copy(update={'hidden': (24, 16, 16)}), seed=1).state()
     with pytest.raises(SacError, match=r"missing \[\], unknown \[.*'critic\.6'"):
         sac.load_state(deeper)
-    wider = SAC(O, A, SETTINGS.model_copy(update={'hidden': (24, 32)}), seed=1).state()
+    wider = SAC(OBS, ACT, SETTINGS.model_copy(update={'hidden': (24, 32)}), seed=1).state()
     with pytest.raises(SacError, match=r'actor\.body\.2\.weight is .*\(32, 24\).* \(16, 24\)'):
         sac.load_state(wider)
     assert same(sac.state(), before)

@@ -1,4 +1,4 @@
-"""Tasks: what their names mean, that every environment keeps the same contract, and what is refused."""
+"""Tasks: what their names mean, the contract of every environment, and what is refused."""
 
 import math
 import subprocess
@@ -9,10 +9,9 @@ import gymnasium
 import numpy as np
 import pytest
 from builders import tiny
-from gymnasium import spaces
-
 from codetr_ros.config import SettingsError
 from codetr_ros.tasks import TASKS, TaskError, check, find, make, r_max
+from gymnasium import spaces
 
 NAMES = [
     *('HalfCheetah-v5', 'Hopper-v5', 'Walker2d-v5', 'Ant-v4', 'Humanoid-v5', 'Swimmer-v5'),
@@ -24,9 +23,9 @@ NAMES = [
 
 
 class Counting(gymnasium.Env):
-    """Counts steps; says what its arguments tell it to. Its action arrives as the second observation."""
+    """Counts steps: the first observation. The second is the action as it arrived."""
 
-    metadata = {'render_fps': 20}
+    metadata = {'render_fps': 20, 'render_modes': []}
     shape = (2,)
     observation_space = spaces.Box(-np.inf, np.inf, (2,))
     action_space = spaces.Box(np.float32(-1), np.float32(3), (1,))
@@ -222,14 +221,23 @@ def test_a_name_that_is_no_id_at_all_is_refused():
         find('a b')
 
 
-def test_a_task_that_gymnasium_no_longer_has_is_refused_with_the_reason():
-    with pytest.raises(TaskError, match="'Ant-v2' cannot be made: .*moved to .*`codetr tasks`"):
-        make('Ant-v2')
+def test_the_papers_own_version_of_a_task_is_refused_with_the_one_that_stands_in_for_it():
+    with pytest.raises(TaskError, match=r"'Ant-v2' \(close: Ant-v4.*max_episode_steps is None"):
+        find('Ant-v2')
+
+
+def test_a_task_whose_environment_cannot_be_imported_is_refused_with_the_reason(counting):
+    name = counting()
+    gymnasium.registry[name].entry_point = 'no_such_module:Environment'
+    with pytest.raises(TaskError, match=rf"'{name}' cannot be made: .*no_such_module.* Install"):
+        make(name)
 
 
 def test_a_task_without_a_horizon_is_refused(counting):
     name = counting(horizon=None)
-    with pytest.raises(TaskError, match=f"'{name}' has max_episode_steps=None"):
+    with pytest.raises(
+        TaskError, match=f"'{name}'.* has no horizon, its max_episode_steps is None"
+    ):
         find(name)
 
 
@@ -284,7 +292,8 @@ def test_an_environment_that_truncates_before_its_horizon_is_refused(counting):
 def test_finding_a_task_imports_no_simulation_and_making_an_old_version_warns_of_nothing(tmp_path):
     code = (
         'import sys; from codetr_ros import tasks; tasks.find("cheetah-run")\n'
-        'heavy = {"gymnasium", "mujoco", "dm_control", "torch"} & set(sys.modules); assert not heavy, heavy\n'
+        'heavy = {"gymnasium", "mujoco", "dm_control", "torch"} & set(sys.modules)\n'
+        'assert not heavy, heavy\n'
         'tasks.make("HalfCheetah-v4").reset(0); tasks.make("cheetah-run").reset(0)'
     )
     arguments = [sys.executable, '-W', 'default::DeprecationWarning:gymnasium', '-c', code]

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-
 from codetr_ros.records import CompositeReward, RecordError, StepRewards, Transitions
 from codetr_ros.trajectories import Trajectories
 
-O, A, DELAY = 3, 2, 4
+OBSERVATION, ACTION, DELAY = 3, 2, 4
 
 
 class Naive:
@@ -18,44 +17,67 @@ class Naive:
         self.sequence: dict[str, int] = {}
         self.current: dict[str, int] = {}
 
-    def chunk(self, source: str, steps: int, end: str | None = None, phase: int = 0) -> Transitions:
+    def chunk(
+        self, source: str, steps: int, end: str | None = None, phase: int = 0
+    ) -> Transitions:
         number = self.current.setdefault(source, 0)
         key = (source, number)
         if key not in self.episodes:
-            first = self.rng.normal(size=O).astype(np.float32)
-            self.episodes[key] = {'observations': [first], 'actions': [], 'terminated': False, 'ended': False}
+            first = self.rng.normal(size=OBSERVATION).astype(np.float32)
+            self.episodes[key] = {
+                'observations': [first],
+                'actions': [],
+                'terminated': False,
+                'ended': False,
+            }
         episode = self.episodes[key]
         first_step = len(episode['actions'])
         for _ in range(steps):
-            episode['observations'].append(self.rng.normal(size=O).astype(np.float32))
-            episode['actions'].append(self.rng.uniform(-1, 1, A).astype(np.float32))
+            episode['observations'].append(self.rng.normal(size=OBSERVATION).astype(np.float32))
+            episode['actions'].append(self.rng.uniform(-1, 1, ACTION).astype(np.float32))
         if end:
             episode['ended'], episode['terminated'] = True, end == 'terminated'
             self.current[source] = number + 1
         sequence = self.sequence.get(source, 0)
         self.sequence[source] = sequence + 1
         return Transitions(
-            'run', source, sequence, phase, number, first_step, steps,
-            np.array(episode['observations'][first_step:]), np.array(episode['actions'][first_step:]),
-            end == 'terminated', end == 'truncated', False, 0,
-        )  # fmt: skip
+            'run',
+            source,
+            sequence,
+            phase,
+            number,
+            first_step,
+            steps,
+            np.array(episode['observations'][first_step:]),
+            np.array(episode['actions'][first_step:]),
+            end == 'terminated',
+            end == 'truncated',
+            False,
+            0,
+        )
 
 
-def score(source: str, episode: int, first: int, length: int, value: float = 1.0, sequence: int = 0) -> CompositeReward:
+def score(
+    source: str, episode: int, first: int, length: int, value: float = 1.0, sequence: int = 0
+) -> CompositeReward:
     return CompositeReward('run', source, source, sequence, episode, first, length, value)
 
 
-def labels(source: str, segments: list[tuple[int, int, int]], values: np.ndarray, version: int = 1) -> StepRewards:
+def labels(
+    source: str, segments: list[tuple[int, int, int]], values: np.ndarray, version: int = 1
+) -> StepRewards:
     e, f, n = (np.array(column, np.uint32) for column in zip(*segments, strict=True))
     return StepRewards('run', 0, version, 0, 1, source, e, f, n, values.astype(np.float32))
 
 
 def memory(capacity: int = 1000, margin: int = 100) -> Trajectories:
-    return Trajectories(O, A, DELAY, capacity, margin)
+    return Trajectories(OBSERVATION, ACTION, DELAY, capacity, margin)
 
 
-def filled(seed: int = 0, sources: tuple[str, ...] = ('sim',), episodes: int = 6, capacity: int = 1000):
-    """A memory and the naive one it should equal, with chunks, segments and labels of odd sizes."""
+def filled(
+    seed: int = 0, sources: tuple[str, ...] = ('sim',), episodes: int = 6, capacity: int = 1000
+):
+    """A memory and the naive one it should equal, with chunks and segments of odd sizes."""
     naive, m = Naive(seed), memory(capacity)
     truth: dict[tuple[str, int, int], float] = {}
     for number in range(episodes):
@@ -86,8 +108,11 @@ def test_every_sampled_step_is_one_that_was_put_in_with_its_own_label(sources, c
         for t, action in enumerate(episode['actions']):
             last = t == len(episode['actions']) - 1
             known[episode['observations'][t].tobytes()] = (
-                action, episode['observations'][t + 1], last and episode['terminated'], truth[source, number, t],
-            )  # fmt: skip
+                action,
+                episode['observations'][t + 1],
+                last and episode['terminated'],
+                truth[source, number, t],
+            )
     assert m.steps <= capacity and m.labelled_steps == m.steps
     batch = m.sample_steps(np.random.default_rng(0), 6000)
     seen = set()
@@ -126,12 +151,16 @@ def test_a_segment_batch_holds_the_steps_of_its_episode_and_zeros_beyond(context
 def test_windows_end_with_each_step_and_say_what_precedes_its_segment():
     m, naive, _ = filled(7, episodes=5)
     ids, window = m.segment_ids(), 6
-    rows = [b for b in m.windows(ids, window, 7)]
-    observations = [b.observations[i, : b.lengths[i] + 1] for b in rows for i in range(len(b.lengths))]
+    rows = list(m.windows(ids, window, 7))
+    observations = [
+        b.observations[i, : b.lengths[i] + 1] for b in rows for i in range(len(b.lengths))
+    ]
     contexts = [c for b in rows for c in b.context.tolist()]
     at = 0
     for source, numbers, firsts, lengths in m.segments(ids):
-        for number, first, length in zip(numbers.tolist(), firsts.tolist(), lengths.tolist(), strict=True):
+        for number, first, length in zip(
+            numbers.tolist(), firsts.tolist(), lengths.tolist(), strict=True
+        ):
             everything = np.array(naive.episodes[source, number]['observations'])
             for t in range(first, first + length):
                 begin = max(0, t + 1 - window)
@@ -151,7 +180,9 @@ def test_the_oldest_whole_episodes_leave_first_and_an_unfinished_one_stays():
     assert m.evict() == 6 and m.steps == 8 and m.evicted == 6
     assert [numbers.tolist() for _, numbers, _, _ in m.segments(m.segment_ids())] == [[1]]
     m.append(naive.chunk('sim', 9, 'truncated'))
-    assert m.evict() == 5 and m.steps == 12  # the newest episode alone is too large, and is kept whole
+    assert (
+        m.evict() == 5 and m.steps == 12
+    )  # the newest episode alone is too large, and is kept whole
 
 
 def test_steps_without_a_label_are_never_sampled():
@@ -161,7 +192,12 @@ def test_steps_without_a_label_are_never_sampled():
         m.sample_steps(np.random.default_rng(0), 1)
     m.apply(labels('sim', [(0, 0, DELAY)], np.arange(DELAY)))
     assert m.labelled_steps == DELAY
-    assert set(m.sample_steps(np.random.default_rng(0), 200).rewards.tolist()) == {0.0, 1.0, 2.0, 3.0}
+    assert set(m.sample_steps(np.random.default_rng(0), 200).rewards.tolist()) == {
+        0.0,
+        1.0,
+        2.0,
+        3.0,
+    }
 
 
 def test_labels_of_evicted_episodes_are_counted_and_passed_over():
@@ -184,7 +220,9 @@ def test_labels_of_evicted_episodes_are_counted_and_passed_over():
         (score('sim', 0, 0, DELAY, 9.0), 'has its composite reward already'),
     ],
 )
-def test_a_score_for_a_segment_that_does_not_exist_or_again_is_refused_and_changes_nothing(wrong, said):
+def test_a_score_for_a_segment_that_does_not_exist_or_again_is_refused_and_changes_nothing(
+    wrong, said
+):
     naive, m = Naive(0), memory()
     m.append(naive.chunk('sim', 6))
     m.score(score('sim', 0, 0, DELAY, 1.5))
@@ -208,7 +246,9 @@ def test_steps_that_do_not_follow_on_are_refused_and_change_nothing():
     m.append(naive.chunk('sim', 3))
     naive.chunk('sim', 2)
     gap = naive.chunk('sim', 2)
-    with pytest.raises(RecordError, match="'sim' sent episode 0 step 5 .* episode 0 step 3 follows"):
+    with pytest.raises(
+        RecordError, match="'sim' sent episode 0 step 5 .* episode 0 step 3 follows"
+    ):
         m.append(gap)
     assert m.steps == 3
 
@@ -235,8 +275,8 @@ def test_the_scale_and_the_moments_are_those_of_what_is_held():
 def test_the_memory_takes_the_bytes_it_states():
     naive, m = Naive(0), memory(capacity=100, margin=100)
     m.append(naive.chunk('sim', 100, 'truncated'))
-    assert m.bytes_per_step == 4 * (O + A) + 10
-    assert m.nbytes == 100 * m.bytes_per_step + 4 * O
+    assert m.bytes_per_step == 4 * (OBSERVATION + ACTION) + 10
+    assert m.nbytes == 100 * m.bytes_per_step + 4 * OBSERVATION
 
 
 def test_scoring_and_evicting_for_long_keeps_the_table_of_segments_small():

@@ -1,7 +1,9 @@
-"""The one configuration of a run: typed, validated, and the origin of CLI flags, YAML keys and ROS parameters.
+"""The one configuration of a run: typed, validated, and the origin of CLI flags, YAML keys and ROS
+parameters.
 
-The defaults are the paper's (its supplement's Table 1 and A.2; where that is silent, the decision is marked
-"decided here"). Presets change some of them: `quick`, `cpu` and `paper` are the YAML files of `presets/`.
+The defaults are the paper's (its supplement's Table 1 and A.2; where that is silent, the decision
+is marked "decided here"). Presets change some of them: `quick`, `cpu` and `paper` are the YAML
+files of `presets/`.
 """
 
 import hashlib
@@ -26,13 +28,19 @@ PRESETS = ('quick', 'cpu', 'paper')
 
 
 class SettingsError(ValueError):
-    """A setting that is unknown or out of range: the message names it, its value and what is allowed."""
+    """A setting that is unknown or out of range: the message names it, its value and what is
+    allowed.
+    """
 
 
 class Group(BaseModel):
-    """Base of all settings: immutable, nothing unknown, nothing converted that would hide a mistake."""
+    """Base of all settings: immutable, nothing unknown, nothing converted that would hide a
+    mistake.
+    """
 
-    model_config = ConfigDict(extra='forbid', frozen=True, validate_default=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        extra='forbid', frozen=True, validate_default=True, allow_inf_nan=False
+    )
 
 
 class CodetrSettings(Group):
@@ -40,8 +48,12 @@ class CodetrSettings(Group):
 
     layers: int = Field(3, ge=1, le=24, description='causal transformer layers')
     heads: int = Field(4, ge=1, le=64, description='attention heads of each causal layer')
-    embedding: int = Field(256, ge=4, le=4096, description='embedding dimension d; divisible by heads')
-    dropout: float = Field(0.1, ge=0, lt=1, description='dropout of embeddings, attention and residuals')
+    embedding: int = Field(
+        256, ge=4, le=4096, description='embedding dimension d; divisible by heads'
+    )
+    dropout: float = Field(
+        0.1, ge=0, lt=1, description='dropout of embeddings, attention and residuals'
+    )
     batch: int = Field(64, ge=1, le=65536, description='segments in a gradient step')
     learning_rate: float = Field(5e-5, gt=0, le=1, description='AdamW learning rate')
     weight_decay: float = Field(1e-4, ge=0, le=1, description='AdamW weight decay')
@@ -49,43 +61,61 @@ class CodetrSettings(Group):
         100, ge=0, le=10**7, description='gradient steps of linear learning-rate warm-up'
     )
     schedule: Literal['constant', 'cosine'] = Field(
-        'cosine', description='learning rate after its warm-up (decided here; not in the supplement)'
+        'cosine',
+        description='learning rate after its warm-up (decided here; not in the supplement)',
     )
     total_gradient_steps: int = Field(
-        10_000, ge=1, le=10**9, description='gradient steps after which the cosine schedule has decayed to a tenth'
+        10_000,
+        ge=1,
+        le=10**9,
+        description='gradient steps after which the cosine schedule has decayed to a tenth',
     )
     first_gradient_steps: int = Field(
         100, ge=0, le=10**6, description='gradient steps after the last warm-up phase'
     )
-    gradient_steps: int = Field(10, ge=0, le=10**6, description='gradient steps after every later phase')
+    gradient_steps: int = Field(
+        10, ge=0, le=10**6, description='gradient steps after every later phase'
+    )
     tokens: Literal['pair', 'merged'] = Field(
-        'pair', description='pair: a state and an action token per step, as the paper; merged: one, twice as fast'
+        'pair',
+        description='pair: a state and an action token per step, as the paper; merged: one, '
+        'twice as fast',
     )
     head_scale: Literal['inverse', 'inverse_sqrt', 'one'] = Field(
         'inverse_sqrt',
-        description='factor on the in-sequence attention logits: 1/d, 1/sqrt(d) (decided here) or 1 (published code)',
+        description='factor on the in-sequence attention logits: 1/d, 1/sqrt(d) (decided here) '
+        'or 1 (published code)',
     )
     weights: Literal['attention', 'one'] = Field(
-        'attention', description="w_t: column sums of the in-sequence attention, or fixed to 1 (an ablation)"
+        'attention',
+        description='w_t: column sums of the in-sequence attention, or fixed to 1 (an ablation)',
     )
     attention_scope: Literal['segment', 'window'] = Field(
-        'segment', description='in-sequence attention sees the segment only, or the context before it as well'
+        'segment',
+        description='in-sequence attention sees the segment only, or the context before it as '
+        'well',
     )
     context: Literal['segment', 'episode'] = Field(
-        'segment', description='the causal transformer starts at the segment, or up to `window` steps before it'
+        'segment',
+        description='the causal transformer starts at the segment, or up to `window` steps '
+        'before it',
     )
     label: Literal['product', 'rhat'] = Field(
-        'product', description='the step reward: w_t * rhat_t, whose sum is the prediction, or rhat_t'
+        'product',
+        description='the step reward: w_t * rhat_t, whose sum is the prediction, or rhat_t',
     )
     labelling: Literal['segment', 'window'] = Field(
         'segment',
-        description='label whole segments in one pass, or each step from the `window` steps that end with it',
+        description='label whole segments in one pass, or each step from the `window` steps '
+        'that end with it',
     )
     window: int = Field(100, ge=1, le=10_000, description='prediction window H [steps]')
     normalise_observations: bool = Field(
         True, description='standardise observations by warm-up mean and deviation (decided here)'
     )
-    label_batch: int = Field(256, ge=1, le=65536, description='segments or windows labelled in one pass')
+    label_batch: int = Field(
+        256, ge=1, le=65536, description='segments or windows labelled in one pass'
+    )
 
     @model_validator(mode='after')
     def _heads_divide_embedding(self) -> 'CodetrSettings':
@@ -97,55 +127,101 @@ class CodetrSettings(Group):
 class SacSettings(Group):
     """Soft actor-critic as jaxrl has it (section 8 of the method)."""
 
-    hidden: tuple[int, ...] = Field((256, 256), min_length=1, max_length=8, description='hidden layer widths')
+    hidden: tuple[int, ...] = Field(
+        (256, 256), min_length=1, max_length=8, description='hidden layer widths'
+    )
     batch: int = Field(256, ge=1, le=65536, description='steps in an update')
-    actor_learning_rate: float = Field(3e-4, gt=0, le=1, description='Adam learning rate of the actor')
-    critic_learning_rate: float = Field(3e-4, gt=0, le=1, description='Adam learning rate of the critics')
-    temperature_learning_rate: float = Field(3e-4, gt=0, le=1, description='Adam learning rate of the temperature')
+    actor_learning_rate: float = Field(
+        3e-4, gt=0, le=1, description='Adam learning rate of the actor'
+    )
+    critic_learning_rate: float = Field(
+        3e-4, gt=0, le=1, description='Adam learning rate of the critics'
+    )
+    temperature_learning_rate: float = Field(
+        3e-4, gt=0, le=1, description='Adam learning rate of the temperature'
+    )
     discount: float = Field(0.99, ge=0, le=1, description='discount factor gamma')
     tau: float = Field(0.005, gt=0, le=1, description='Polyak step of the target critics')
-    initial_temperature: float = Field(1.0, gt=0, le=1000, description='entropy temperature at the start')
+    initial_temperature: float = Field(
+        1.0, gt=0, le=1000, description='entropy temperature at the start'
+    )
     target_entropy: float = Field(
-        -0.5, ge=-10, le=10, description='target entropy in units of the action size: -0.5 as jaxrl, often -1 elsewhere'
+        -0.5,
+        ge=-10,
+        le=10,
+        description='target entropy in units of the action size: -0.5 as jaxrl, often -1 '
+        'elsewhere',
     )
     updates_per_step: float = Field(1.0, ge=0, le=100, description='updates per environment step')
-    burst: int = Field(50, ge=1, le=100_000, description='updates between two looks at arriving messages')
+    burst: int = Field(
+        50, ge=1, le=100_000, description='updates between two looks at arriving messages'
+    )
 
 
 class Settings(Group):
     """Everything that the nodes of a run must agree on."""
 
-    task: str = Field('Ant-v4', min_length=1, description='task: a name of `codetr tasks` or any Gymnasium id')
-    composite: Composite = Field('sum', description='how a segment\'s rewards make its composite reward')
+    task: str = Field(
+        'Ant-v4', min_length=1, description='task: a name of `codetr tasks` or any Gymnasium id'
+    )
+    composite: Composite = Field(
+        'sum', description="how a segment's rewards make its composite reward"
+    )
     beta: float = Field(3.0, gt=0, le=1000, description='inverse temperature of the soft maximum')
-    delay: int = Field(25, ge=1, le=100_000, description='steps n of a segment: one composite reward comes for each')
-    method: Method = Field('codetr', description='how step rewards are made from composite rewards')
+    delay: int = Field(
+        25,
+        ge=1,
+        le=100_000,
+        description='steps n of a segment: one composite reward comes for each',
+    )
+    method: Method = Field(
+        'codetr', description='how step rewards are made from composite rewards'
+    )
     steps: int = Field(1_000_000, ge=1, le=10**9, description='environment steps of the run')
     seed: int = Field(0, ge=0, le=2**31 - 1, description='seed of everything random')
     phase_steps: int = Field(1000, ge=1, le=10**6, description='environment steps of a phase')
-    warmup_steps: int = Field(10_000, ge=1, le=10**8, description='uniformly random steps at the start')
-    overlap: bool = Field(
-        False, description='simulate phase k under what phase k-2 taught, while phase k-1 is learnt from'
+    warmup_steps: int = Field(
+        10_000, ge=1, le=10**8, description='uniformly random steps at the start'
     )
-    simulators: int = Field(1, ge=1, le=64, description='simulators among whom the steps of a phase are divided')
-    memory_steps: int = Field(1_000_000, ge=1, le=10**9, description='steps that the memory D holds')
-    evaluate_every: int = Field(5000, ge=0, le=10**9, description='steps between evaluations; 0: none')
+    overlap: bool = Field(
+        False,
+        description='simulate phase k under what phase k-2 taught, while phase k-1 is learnt from',
+    )
+    simulators: int = Field(
+        1, ge=1, le=64, description='simulators among whom the steps of a phase are divided'
+    )
+    memory_steps: int = Field(
+        1_000_000, ge=1, le=10**9, description='steps that the memory D holds'
+    )
+    evaluate_every: int = Field(
+        5000, ge=0, le=10**9, description='steps between evaluations; 0: none'
+    )
     evaluate_episodes: int = Field(10, ge=1, le=10_000, description='episodes of an evaluation')
     r_max: float | None = Field(
-        None, gt=0, le=1e9, description="largest reward of a step, for scores; the task's own where not given"
+        None,
+        gt=0,
+        le=1e9,
+        description="largest reward of a step, for scores; the task's own where not given",
     )
     target_scale: Literal['rms', 'none'] = Field(
         'rms',
-        description='unit c of composite rewards: root mean square per step of the warm-up (decided here), or 1',
+        description='unit c of composite rewards: root mean square per step of the warm-up '
+        '(decided here), or 1',
     )
     reward_unit: Literal['scaled', 'raw'] = Field(
-        'scaled', description='step rewards that the learner sees: in units of c (decided here), or unscaled'
+        'scaled',
+        description='step rewards that the learner sees: in units of c (decided here), or '
+        'unscaled',
     )
     record_relabels: Literal['first', 'all'] = Field(
-        'first', description='labels in the bag: the first of each segment and all at evaluations, or every one'
+        'first',
+        description='labels in the bag: the first of each segment and all at evaluations, or '
+        'every one',
     )
     threads: int = Field(1, ge=1, le=256, description='torch threads of each process')
-    codetr: CodetrSettings = Field(default_factory=CodetrSettings, description='the reward transformer')
+    codetr: CodetrSettings = Field(
+        default_factory=CodetrSettings, description='the reward transformer'
+    )
     sac: SacSettings = Field(default_factory=SacSettings, description='the policy learner')
 
     @property
@@ -160,7 +236,7 @@ class Settings(Group):
 
     @property
     def lag(self) -> int:
-        """Phases between what taught a policy and where it acts: 1 in lock-step, 2 with overlap."""
+        """Phases from what taught a policy to where it acts: 1 in lock-step, 2 with overlap."""
         return 2 if self.overlap else 1
 
     def steps_of(self, phase: int) -> int:
@@ -172,15 +248,20 @@ class Settings(Group):
         return min(self.steps, (version + 1) * self.phase_steps)
 
     def evaluated(self, version: int) -> bool:
-        """Whether this policy version is evaluated: the last one, and the first past each multiple.
+        """Whether this policy version is evaluated: the last one, and the first past each
+        multiple.
 
-        Policies of the warm-up act at random and are not evaluated again: the random policy is, once, at step 0.
+        Policies of the warm-up act at random and are not evaluated again: the random policy is,
+        once, at step 0.
         """
         if self.evaluate_every == 0 or version < self.warmup_phases - 1:
             return False
         if version == self.phases - 1:
             return True
-        return self.steps_after(version) // self.evaluate_every > self.steps_after(version - 1) // self.evaluate_every
+        return (
+            self.steps_after(version) // self.evaluate_every
+            > self.steps_after(version - 1) // self.evaluate_every
+        )
 
     def canonical(self) -> str:
         """The settings as JSON, the same for the same settings on every machine."""
@@ -207,17 +288,19 @@ class Settings(Group):
         """A copy with some settings changed, given by dotted name.
 
         Raises:
-            SettingsError: a name is unknown or a value is not allowed; `source` says where it came from.
+            SettingsError: a name is unknown or a value is not allowed; `source` says where it came
+                from.
         """
         data = self.model_dump()
         for name, value in changes.items():
             *groups, last = name.split('.')
             place = data
             for group in groups:
-                place = place.get(group) if isinstance(place, dict) else None  # type: ignore[assignment]
+                place = place.get(group, {}) if isinstance(place, dict) else {}
             if not isinstance(place, dict) or last not in place:
                 raise SettingsError(
-                    f'{source}: there is no setting {name!r} (value {value!r}). Settings are: {", ".join(self.flat())}'
+                    f'{source}: there is no setting {name!r} (value {value!r}). Settings are: '
+                    f'{", ".join(self.flat())}'
                 )
             place[last] = value
         return parse(data, source)
@@ -265,7 +348,9 @@ def load(name: str) -> Settings:
     else:
         path = Path(name)
         if not path.is_file():
-            raise SettingsError(f'config {name!r} is neither a preset ({", ".join(PRESETS)}) nor a file')
+            raise SettingsError(
+                f'config {name!r} is neither a preset ({", ".join(PRESETS)}) nor a file'
+            )
         text, source = path.read_text(), str(path)
     try:
         data = yaml.safe_load(text)

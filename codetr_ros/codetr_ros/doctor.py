@@ -1,4 +1,4 @@
-"""`codetr doctor`: is everything there that a run needs? One line for each check, with what to do."""
+"""`codetr doctor`: is everything there that a run needs? A line for each check, with a remedy."""
 
 import dataclasses
 import importlib
@@ -67,7 +67,7 @@ def middleware() -> Check:
     try:
         utilities = importlib.import_module('rclpy.utilities')
         found = str(utilities.get_rmw_implementation_identifier())
-    except Exception as error:  # rclpy raises what its C library says
+    except Exception as error:  # noqa: BLE001  rclpy raises what its C library says
         return Check('RMW', 'fail', f'{type(error).__name__}: {error}', _INSTALL)
     if found != 'rmw_fastrtps_cpp':
         remedy = 'everything here is measured with it: unset RMW_IMPLEMENTATION'

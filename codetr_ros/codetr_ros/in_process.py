@@ -1,4 +1,5 @@
-"""Algorithm 1 with plain calls instead of topics: the same cores, in the same order, in one process.
+"""Algorithm 1 with plain calls instead of topics: the same cores, in the same order, in one
+process.
 
 With the same seed, pace and thread count a run over topics ends with the same weights as this one.
 """
@@ -26,16 +27,22 @@ _log = logging.getLogger(__name__)
 
 
 class Core(Protocol):
-    """What every part of a run is, whoever wires it: it takes records in, works in slices, gives records out."""
+    """What every part of a run is, whoever wires it: it takes records in, works in slices, gives
+    records out.
+    """
 
     subscribes: tuple[type, ...]
     finished: bool
 
     def receive(self, record: Record) -> None:
-        """Store a record; raises `RecordError` for what must be refused, and has then changed nothing."""
+        """Store a record; raises `RecordError` for what must be refused, and has then changed
+        nothing.
+        """
 
     def work(self) -> Iterator[list[Record] | None]:
-        """One slice for each `next()`: the records that became ready, or None while there is nothing to do."""
+        """One slice for each `next()`: the records that became ready, or None while there is
+        nothing to do.
+        """
 
     def close(self) -> None:
         """Save what must outlast the process; harmless when called again."""
@@ -76,7 +83,7 @@ def run(
     cores['evaluate'] = ('evaluate', Evaluator(spec, settings, 'evaluate'))
     published: dict[str, Counter[str]] = {name: Counter() for name in cores}
     received: dict[str, Counter[str]] = {name: Counter() for name in cores}
-    seconds: Counter[str] = Counter()
+    seconds = dict.fromkeys(cores, 0.0)
     works = {name: core.work() for name, (_, core) in cores.items()}
     observe(spec)
     finished = False
@@ -101,7 +108,10 @@ def run(
             finished = all(core.finished for _, core in cores.values())
             if idle and not finished:
                 waiting = [name for name, (_, core) in cores.items() if not core.finished]
-                raise RuntimeError(f'every part of the run waits for another: {", ".join(waiting)} have not finished')
+                raise RuntimeError(
+                    f'every part of the run waits for another: {", ".join(waiting)} have not '
+                    'finished'
+                )
     finally:
         reports = {}
         for name, (role, core) in cores.items():

@@ -1,4 +1,6 @@
-"""What both consumers do with arriving records: check them once, hold what came early, give out what a commit names."""
+"""What both consumers do with arriving records: check them once, hold what came early, give out
+what a commit names.
+"""
 
 import logging
 from collections import Counter
@@ -33,7 +35,8 @@ def check_run(record: Record, run: RunSpec) -> None:
     """
     if record.run_id != run.run_id:
         raise RecordError(
-            f'{describe(record)} is of run {record.run_id!r}, this is run {run.run_id!r}: stop the other run, or give '
+            f'{describe(record)} is of run {record.run_id!r}, this is run {run.run_id!r}: stop '
+            'the other run, or give '
             f'each run a namespace of its own'
         )
 
@@ -70,19 +73,23 @@ class Tasks:
         check_run(spec, self._run)
         if spec.protocol_version != PROTOCOL_VERSION:
             raise RecordError(
-                f'{spec.source!r} speaks protocol {spec.protocol_version}, this node {PROTOCOL_VERSION}: install the same '
+                f'{spec.source!r} speaks protocol {spec.protocol_version}, this node '
+                f'{PROTOCOL_VERSION}: install the same '
                 f'version of codetr_ros on both'
             )
         for known in self.specs.values():
             for name in ('task', 'observation_size', 'action_size', 'horizon', 'r_max'):
                 if getattr(known, name) != getattr(spec, name):
                     raise RecordError(
-                        f'{spec.source!r} has {name}={getattr(spec, name)!r}, {known.source!r} has '
-                        f'{getattr(known, name)!r}: all simulators of a run must simulate the same task'
+                        f'{spec.source!r} has {name}={getattr(spec, name)!r}, {known.source!r} '
+                        'has '
+                        f'{getattr(known, name)!r}: all simulators of a run must simulate the '
+                        'same task'
                     )
         if spec.source not in self.specs and self.known:
             raise RecordError(
-                f'{spec.source!r} is one simulator too many: the run has simulators={self._expected} '
+                f'{spec.source!r} is one simulator too many: the run has '
+                f'simulators={self._expected} '
                 f'({", ".join(self.sources)}). Start the run with more, or stop this one'
             )
         self.specs[spec.source] = spec
@@ -101,19 +108,22 @@ def check_transitions(chunk: Transitions, spec: TaskSpec) -> None:
     for name, array, expected in shapes:
         if chunk.steps < 1 or array.shape != expected:
             raise RecordError(
-                f'{describe(chunk)}: {name} have shape {array.shape}, {expected} expected of task {spec.task} as '
+                f'{describe(chunk)}: {name} have shape {array.shape}, {expected} expected of task '
+                f'{spec.task} as '
                 f'{spec.source!r} announced it'
             )
         bad = np.argwhere(~np.isfinite(array))
         if len(bad):
             step, component = bad[0].tolist()
             raise RecordError(
-                f'{describe(chunk)}: {name}[{step}, {component}] is {array[step, component]}: all values must be finite; '
+                f'{describe(chunk)}: {name}[{step}, {component}] is {array[step, component]}: all '
+                'values must be finite; '
                 f'mend what {spec.source!r} publishes'
             )
     if chunk.first_step + chunk.steps > spec.horizon:
         raise RecordError(
-            f'{describe(chunk)}: step {chunk.first_step + chunk.steps} lies beyond the horizon {spec.horizon} of {spec.task}'
+            f'{describe(chunk)}: step {chunk.first_step + chunk.steps} lies beyond the horizon '
+            f'{spec.horizon} of {spec.task}'
         )
 
 
@@ -124,13 +134,18 @@ def check_score(reward: CompositeReward, delay: int) -> None:
         RecordError: names the field and its value.
     """
     if not np.isfinite(reward.value):
-        raise RecordError(f'{describe(reward)}: value is {reward.value}: a composite reward must be finite')
+        raise RecordError(
+            f'{describe(reward)}: value is {reward.value}: a composite reward must be finite'
+        )
     if not 1 <= reward.length <= delay:
-        raise RecordError(f'{describe(reward)}: length is {reward.length}: a segment has 1 to {delay} steps')
+        raise RecordError(
+            f'{describe(reward)}: length is {reward.length}: a segment has 1 to {delay} steps'
+        )
 
 
 class Intake:
-    """Holds what arrived until a commit says to which phase it belongs, then adds it to the memory in order.
+    """Holds what arrived until a commit says to which phase it belongs, then adds it to the memory
+    in order.
 
     Args:
         run: the run to which everything must belong.
@@ -139,7 +154,9 @@ class Intake:
         true_rewards: whether the environment's own rewards are: the in-process oracle only.
     """
 
-    def __init__(self, run: RunSpec, settings: Settings, scores: bool, true_rewards: bool = False) -> None:
+    def __init__(
+        self, run: RunSpec, settings: Settings, scores: bool, true_rewards: bool = False
+    ) -> None:
         self._run = run
         self._settings = settings
         self._scores = scores
@@ -150,7 +167,10 @@ class Intake:
         self._true: dict[tuple[str, int], TrueRewards] = {}
         self._unchecked: list[Transitions] = []
         self._commits: dict[int, Commit] = {}
-        self._taken = {'transitions': Counter[str](), 'scores': Counter[str]()}  # next sequence number due
+        self._taken = {
+            'transitions': Counter[str](),
+            'scores': Counter[str](),
+        }  # next sequence number due
         self.duplicated: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
         self.missing: int | None = None  # a committed phase of which something has not arrived
@@ -171,7 +191,9 @@ class Intake:
             self._receive_transitions(record)
         elif isinstance(record, CompositeReward):
             check_score(record, self._settings.delay)
-            self._hold(record, self._rewards, (record.scorer, record.sequence), self._taken['scores'])
+            self._hold(
+                record, self._rewards, (record.scorer, record.sequence), self._taken['scores']
+            )
         elif isinstance(record, TrueRewards):
             self._true[record.source, record.sequence] = record
         elif isinstance(record, Commit):
@@ -185,22 +207,34 @@ class Intake:
                     f'{describe(chunk)}: {chunk.source!r} is no simulator of this run; these are: '
                     f'{", ".join(self.tasks.sources)}'
                 )
-            self._unchecked.append(chunk)  # its announcement travels on another topic and may come later
+            self._unchecked.append(
+                chunk
+            )  # its announcement travels on another topic and may come later
             return
         check_transitions(chunk, spec)
-        self._hold(chunk, self._transitions, (chunk.source, chunk.sequence), self._taken['transitions'])
+        self._hold(
+            chunk, self._transitions, (chunk.source, chunk.sequence), self._taken['transitions']
+        )
 
-    def _hold(self, record: Any, held: dict[tuple[str, int], Any], key: tuple[str, int], taken: 'Counter[str]') -> None:
+    def _hold(
+        self,
+        record: Any,
+        held: dict[tuple[str, int], Any],
+        key: tuple[str, int],
+        taken: 'Counter[str]',
+    ) -> None:
         if key in held or key[1] < taken[key[0]]:
             self.duplicated[TOPICS[type(record)]] += 1
         else:
             held[key] = record
 
     def take(self, phase: int, memory: Trajectories) -> bool:
-        """Add everything that the phase's commit names to the memory, ordered by source and number.
+        """Add everything that the phase's commit names to the memory, ordered by source and
+        number.
 
         Returns:
-            Whether it was all there. If not, nothing was added, and `missing` is the phase where its commit is known.
+            Whether it was all there. If not, nothing was added, and `missing` is the phase where
+            its commit is known.
 
         Raises:
             RecordError: what is committed contradicts itself: the run cannot go on.
@@ -209,7 +243,11 @@ class Intake:
         if commit is None:
             return False
         chunks = self._named(commit.sources, commit.transitions, self._transitions, 'transitions')
-        scores = self._named(commit.scorers, commit.scores, self._rewards, 'scores') if self._scores else []
+        scores = (
+            self._named(commit.scorers, commit.scores, self._rewards, 'scores')
+            if self._scores
+            else []
+        )
         true = [(c.source, c.sequence) for c in chunks or () if self._true_rewards]
         if chunks is None or scores is None or any(key not in self._true for key in true):
             self.missing = phase
@@ -224,7 +262,9 @@ class Intake:
             del self._rewards[reward.scorer, reward.sequence]
             try:
                 memory.score(reward)
-            except RecordError as error:  # a wrong score spoils no run: it is said, counted, and left out
+            except (
+                RecordError
+            ) as error:  # a wrong score spoils no run: it is said, counted, and left out
                 self.refused[TOPICS[CompositeReward]] += 1
                 _log.error('%s', error)
         for names, last, kind in (
@@ -236,7 +276,9 @@ class Intake:
         memory.evict()
         return True
 
-    def _named(self, names: tuple[str, ...], last: Any, held: dict[tuple[str, int], Any], kind: str) -> list[Any] | None:
+    def _named(
+        self, names: tuple[str, ...], last: Any, held: dict[tuple[str, int], Any], kind: str
+    ) -> list[Any] | None:
         found = []
         for name, number in sorted(zip(names, last.tolist(), strict=True)):
             for sequence in range(self._taken[kind][name], number + 1):

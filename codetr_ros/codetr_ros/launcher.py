@@ -5,6 +5,7 @@ and then killed, and should the parent itself be killed, the kernel sends them S
 """
 
 import ctypes
+import json
 import os
 import shlex
 import signal
@@ -90,9 +91,12 @@ def commands(
         arguments = [str(executable(role, environ)), '--ros-args', '-r', f'__ns:=/run_{run_id}']
         if role == 'sim' and name != 'sim':
             arguments += ['-r', f'__node:={name}']
-        arguments += ['-p', f'folder:={folder}']
+        parameters = {'folder': str(folder)}
         if role == 'learner':
-            arguments += ['-p', f'config:={folder / run_folder.CONFIG}', '-p', f'run_id:={run_id}']
+            parameters |= {'config': str(folder / run_folder.CONFIG), 'run_id': run_id}
+        for parameter, value in parameters.items():
+            # ROS reads the value as YAML: without quotes, blanks and colons in a path break it.
+            arguments += ['-p', f'{parameter}:={json.dumps(value, ensure_ascii=False)}']
         found.append(Command(name, role, tuple(arguments)))
     return found
 
@@ -235,7 +239,8 @@ class Processes:
                         stderr=subprocess.STDOUT,
                         env=dict(env),
                         start_new_session=True,
-                        preexec_fn=prepare,
+                        # It makes one system call, looked up before: safe beside ROS's threads.
+                        preexec_fn=prepare,  # noqa: PLW1509
                     )
                 except OSError as error:
                     what = f'{command.name} ({command.arguments[0]})'
@@ -275,7 +280,7 @@ class Processes:
             if time.monotonic() - began > limit:
                 for node in waiting:
                     self.say(
-                        f'{node.name} did not end within {limit:g} s of being asked to: killing it'
+                        f'{node.name} did not end {limit:g} s after SIGINT: killing it'
                     )
                 self.kill(waiting)
                 return

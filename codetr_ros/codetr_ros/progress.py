@@ -21,6 +21,7 @@ from codetr_ros.config import Settings
 from codetr_ros.records import Commit, EpisodeResult, Metrics, Presence, Record
 
 _PLAIN_EVERY = 5.0  # seconds between plain lines that no evaluation asks for
+_LIVE_EVERY = 0.25  # seconds between changes of the display
 _RATE_WINDOW = 5  # phases over which the present speed is measured
 
 
@@ -55,13 +56,8 @@ class Progress:
         self._stream = stream or sys.stdout
         self._console = Console(file=self._stream)
         wanted = self._console.is_terminal if live is None else live
-        # The display asks for its content from a thread of its own, four times a second: `_render`
-        # only reads.
-        self._live = (
-            Live(get_renderable=self._render, console=self._console, refresh_per_second=4)
-            if wanted
-            else None
-        )
+        # No thread of its own: records and the display would have to be kept from each other.
+        self._live = Live(console=self._console, auto_refresh=False) if wanted else None
         self._clock = clock
         self._began = clock()
         self._shown = self._began
@@ -77,6 +73,7 @@ class Progress:
     def __enter__(self) -> 'Progress':
         if self._live is not None:
             self._live.start()
+            self.tick()
         return self
 
     def __exit__(
@@ -86,7 +83,7 @@ class Progress:
         trace: TracebackType | None,
     ) -> None:
         if self._live is not None:
-            self._live.refresh()
+            self._live.update(self._render(), refresh=True)
             self._live.stop()
 
     def say(self, text: str, style: str = '') -> None:
@@ -111,8 +108,18 @@ class Progress:
             # Older recordings of presence have no such field.
             missed: Any = getattr(record, 'missed', ())
             self._missed[record.node] = int(np.sum(missed))
-        if self._live is None and self._clock() - self._shown >= _PLAIN_EVERY:
+        self.tick()
+
+    def tick(self) -> None:
+        """Show how things are, if it is time; to be called now and then while nothing arrives."""
+        now = self._clock()
+        if now - self._shown < (_PLAIN_EVERY if self._live is None else _LIVE_EVERY):
+            return
+        self._shown = now
+        if self._live is None:
             self._plain()
+        else:
+            self._live.update(self._render(), refresh=True)
 
     def _take(self, result: EpisodeResult) -> None:
         if result.purpose == 'random':
@@ -174,7 +181,6 @@ class Progress:
         return facts
 
     def _plain(self) -> None:
-        self._shown = self._clock()
         facts = [f'{name} {text}' for name, text in self._facts() if name != 'evaluation']
         self.say(', '.join(([self._note] if self._note else []) + facts))
 

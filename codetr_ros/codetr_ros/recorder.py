@@ -1,7 +1,7 @@
 """What a phase consists of: the recorder decides when it is whole and commits it.
 
-The core knows nothing of bags. Whoever wires it writes everything it has been given to disk before passing a
-`Commit` on: what a node learns from is then never lost.
+The core knows nothing of bags. Whoever wires it writes everything it has been given to disk before
+passing a `Commit` on: what a node learns from is then never lost.
 """
 
 import time
@@ -37,7 +37,7 @@ class Recorder:
         name: node name.
     """
 
-    subscribes = (TaskSpec, Policy, Transitions, CompositeReward)
+    subscribes: tuple[type, ...] = (TaskSpec, Policy, Transitions, CompositeReward)
 
     def __init__(self, run: RunSpec, settings: Settings, name: str) -> None:
         self._run = run
@@ -58,7 +58,8 @@ class Recorder:
         """Take note of what arrived.
 
         Raises:
-            RecordError: it is no part of this run, impossible, or out of sequence; nothing has changed.
+            RecordError: it is no part of this run, impossible, or out of sequence; nothing has
+                changed.
         """
         check_run(record, self._run)
         if isinstance(record, TaskSpec):
@@ -71,7 +72,9 @@ class Recorder:
             if spec is not None:
                 check_transitions(record, spec)
             elif self._tasks.known:
-                raise RecordError(f'{describe(record)}: {record.source!r} is no simulator of this run')
+                raise RecordError(
+                    f'{describe(record)}: {record.source!r} is no simulator of this run'
+                )
             if self._next(record, self._transitions, record.source):
                 self._steps[record.phase, record.source] += record.steps
                 if record.phase_end:
@@ -83,7 +86,8 @@ class Recorder:
     def _next(self, record: Any, due: 'Counter[str]', name: str) -> bool:
         if record.sequence > due[name]:
             raise RecordError(
-                f'{describe(record)} is out of sequence: {due[name]} is the next of {name!r}. What lies between never '
+                f'{describe(record)} is out of sequence: {due[name]} is the next of {name!r}. '
+                'What lies between never '
                 f'arrived: restart {name!r}'
             )
         if record.sequence < due[name]:
@@ -100,7 +104,9 @@ class Recorder:
                 yield None
             seconds = time.perf_counter() - began
             step = self._settings.steps_after(phase)
-            said = metrics(self._run.run_id, 'record', self._name, phase, step, {'phase_seconds': seconds})
+            said = metrics(
+                self._run.run_id, 'record', self._name, phase, step, {'phase_seconds': seconds}
+            )
             yield [self._commit(phase), said]
             self.phase = phase + 1
         self.finished = True
@@ -129,11 +135,15 @@ class Recorder:
             last.append(sequence)
             self._committed_scores[source] += due
             scorers.add(source)
-        for scorer in scorers - set(members):  # a person, an inspection: whatever they have said by now
+        for scorer in scorers - set(
+            members
+        ):  # a person, an inspection: whatever they have said by now
             self._committed_scores[scorer] = self._scores[scorer]
         names = tuple(sorted(s for s in scorers if self._committed_scores[s]))
         scores = np.array([self._committed_scores[s] - 1 for s in names], np.int64)
-        return Commit(self._run.run_id, phase, tuple(members), np.array(last, np.int64), names, scores, ())
+        return Commit(
+            self._run.run_id, phase, tuple(members), np.array(last, np.int64), names, scores, ()
+        )
 
     def waiting_for(self) -> str:
         """What the next phase still lacks, for people."""
@@ -146,7 +156,11 @@ class Recorder:
             if have < steps:
                 lacks.append(f'{steps - have} of {steps} steps of {source!r}')
             elif (self.phase, source) in self._ended:
-                due = self._committed_scores[source] + self._ended[self.phase, source][1] - self._scores[source]
+                due = (
+                    self._committed_scores[source]
+                    + self._ended[self.phase, source][1]
+                    - self._scores[source]
+                )
                 if due > 0:
                     lacks.append(f'{due} composite rewards of {source!r}')
         return f'phase {self.phase} lacks ' + (', '.join(lacks) or 'nothing')

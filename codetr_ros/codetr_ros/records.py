@@ -1,8 +1,9 @@
 """What flows between the parts of a run: one frozen dataclass for each message of `codetr_msgs`.
 
 A record has the fields of its message, with the same names, in the same order (the message adds a
-`stamp`, which nothing learns from). Records know nothing of ROS; `codetr_ros.ros.messages` turns one into
-the other. Arrays are numpy; their shapes use T = steps, O = observation size, A = action size.
+`stamp`, which nothing learns from). Records know nothing of ROS; `codetr_ros.ros.messages` turns
+one into the other. Arrays are numpy; their shapes use T = steps, O = observation size, A = action
+size.
 """
 
 from collections.abc import Mapping
@@ -23,7 +24,9 @@ U64 = NDArray[np.uint64]
 
 ROLES = ('sim', 'evaluate', 'reward', 'learner', 'record')
 INITIAL_VERSION = -1
-"""Policy version of the untrained policy; version k is the policy published after training on phase k."""
+"""Policy version of the untrained policy; version k is the policy published after training on
+phase k.
+"""
 
 
 class RecordError(ValueError):
@@ -45,8 +48,8 @@ class RunSpec:
 class Presence:
     """A node says that it is there: on start, once a second, and a last time when it has finished.
 
-    `published` counts the records it has published so far on each of `topics`, so that whoever listens can say what
-    is missing. `missed` counts, in the same order, what it was told was published to it but never reached it.
+    `published` counts the records it has published so far on each of `topics`, so that whoever
+    listens can say what is missing.
     """
 
     run_id: str
@@ -76,7 +79,8 @@ class TaskSpec:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Policy:
-    """The permission for one phase, with the policy to act under. From the learner to the simulators.
+    """The permission for one phase, with the policy to act under. From the learner to the
+    simulators.
 
     Steps that are all zero permit nothing: every phase of the run has been permitted before.
     """
@@ -93,7 +97,9 @@ class Policy:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Transitions:
-    """Consecutive steps of one episode in one phase. From a simulator to recorder, reward and learner."""
+    """Consecutive steps of one episode in one phase. From a simulator to recorder, reward and
+    learner.
+    """
 
     run_id: str
     source: str
@@ -104,7 +110,8 @@ class Transitions:
     steps: int  # T
     observations: F32  # (T+1, O): the observation before each step, and the one after the last
     actions: F32  # (T, A) in [-1, 1]
-    terminated: bool  # the last step ended the episode in a terminal state: nothing is bootstrapped from it
+    # the last step ended the episode in a terminal state: nothing is bootstrapped from it
+    terminated: bool
     truncated: bool  # the last step ended the episode at its horizon
     phase_end: bool  # these are the source's last steps of the phase
     scores_due: int  # on phase_end: composite rewards due for segments that ended in this phase
@@ -112,7 +119,9 @@ class Transitions:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CompositeReward:
-    """The score of one segment. From whoever scores to recorder, reward, and learners that use it directly."""
+    """The score of one segment. From whoever scores to recorder, reward, and learners that use it
+    directly.
+    """
 
     run_id: str
     source: str  # whose segment it is
@@ -126,7 +135,9 @@ class CompositeReward:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Commit:
-    """A phase is on disk, whole: exactly these records belong to it. From the recorder to reward and learner."""
+    """A phase is on disk, whole: exactly these records belong to it. From the recorder to reward
+    and learner.
+    """
 
     run_id: str
     phase: int
@@ -139,7 +150,9 @@ class Commit:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class StepRewards:
-    """New and changed labels after a phase: part `part` of `parts`. From the reward node to learner and recorder."""
+    """New and changed labels after a phase: part `part` of `parts`. From the reward node to
+    learner and recorder.
+    """
 
     run_id: str
     phase: int
@@ -155,24 +168,31 @@ class StepRewards:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class EpisodeResult:
-    """How one episode went. From simulators (training) and the evaluator to recorder and people."""
+    """How one episode went. From simulators (training) and the evaluator to the recorder."""
 
     run_id: str
     source: str
-    purpose: str  # 'training', 'evaluation' or 'random' (evaluation of the uniformly random policy)
-    step: int  # training steps that the policy has learnt from (evaluation), or taken so far (training)
+    purpose: (
+        str  # 'training', 'evaluation' or 'random' (evaluation of the uniformly random policy)
+    )
+    # training steps that the policy has learnt from (evaluation), or taken so far (training)
+    step: int
     version: int  # policy version
     episode: int
     length: int
     true_return: float
     composite_return: float
-    score: float  # composite return / that of an agent that earns r_max at every step of the horizon
+    score: (
+        float  # composite return / that of an agent that earns r_max at every step of the horizon
+    )
     terminated: bool
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TrueRewards:
-    """The environment's own step rewards, for evaluation only: never for the learner or the reward node."""
+    """The environment's own step rewards, for evaluation only: never for the learner or the reward
+    node.
+    """
 
     run_id: str
     source: str
@@ -239,6 +259,9 @@ def describe(record: Record) -> str:
     shown = []
     for f in fields(record):
         value: Any = getattr(record, f.name)
-        if f.name != 'run_id' and isinstance(value, (bool, int, float)) or f.name in ('source', 'node'):
+        if (f.name != 'run_id' and isinstance(value, (bool, int, float))) or f.name in (
+            'source',
+            'node',
+        ):
             shown.append(f'{f.name}={value}')
     return f'{type(record).__name__}({", ".join(shown)})'

@@ -29,48 +29,57 @@ def title(summary: Mapping[str, Any]) -> str:
 def draw(summary: Mapping[str, Any]) -> bytes:
     """The learning curve as a PNG: true return and score of each evaluation against steps.
 
-    The band goes from the worst to the best episode of an evaluation; the dashed line is the
-    random policy.
+    The bands show the spread over an evaluation's episodes: from the worst to the best for the
+    true return, a standard deviation for the score. The dashed lines are the random policy.
     """
     # Without pyplot: no display, no state that outlives the picture, and half the import time.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    rows = summary['evaluations']
-    figure = Figure(figsize=(8, 4.5), dpi=120, layout='constrained')
+    rows, random = summary['evaluations'], summary['random']
+    figure = Figure(figsize=(8, 6), dpi=120, layout='constrained')
     FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    axes.set_title(title(summary), fontsize=11)
-    axes.set_xlabel('environment steps')
-    axes.set_ylabel('true return of an episode', color=_TRUE)
-    axes.grid(alpha=0.3)
-    right = axes.twinx()
-    right.set_ylabel('score (composite return / perfect)', color=_SCORE)
-    if rows:
-        steps = [row['step'] for row in rows]
-        axes.fill_between(
-            steps,
-            [row['true_return_min'] for row in rows],
-            [row['true_return_max'] for row in rows],
-            color=_TRUE,
-            alpha=0.15,
-            linewidth=0,
-            label='worst to best episode',
-        )
-        true = [row['true_return_mean'] for row in rows]
-        axes.plot(steps, true, 'o-', color=_TRUE, markersize=4, label='true return, mean')
-        score = [row['score_mean'] for row in rows]
-        right.plot(steps, score, 's:', color=_SCORE, markersize=3, label='score, mean')
-    else:
-        axes.text(0.5, 0.5, 'no evaluation', transform=axes.transAxes, ha='center')
-    if summary['random']:
-        mean = summary['random']['true_return_mean']
-        axes.axhline(mean, color='#555', linestyle='--', linewidth=1, label='random policy')
-    axes.set_xlim(0, summary['steps_planned'])
-    handles, labels = axes.get_legend_handles_labels()
-    more, names = right.get_legend_handles_labels()
-    if handles or more:
-        axes.legend(handles + more, labels + names, loc='best', fontsize=8, framealpha=0.8)
+    figure.suptitle(title(summary), fontsize=11)
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
+    upper.set_ylabel('true return of an episode')
+    lower.set_ylabel('score\n(composite return / perfect)')
+    lower.set_xlabel('environment steps')
+    lower.set_xlim(0, summary['steps_planned'])
+
+    def column(name: str) -> list[float]:
+        return [row[name] for row in rows]
+
+    score, std = column('score_mean'), column('score_std')
+    for axes, colour, mean, low, high, name in (
+        (
+            upper,
+            _TRUE,
+            column('true_return_mean'),
+            column('true_return_min'),
+            column('true_return_max'),
+            'true_return_mean',
+        ),
+        (
+            lower,
+            _SCORE,
+            score,
+            [m - s for m, s in zip(score, std, strict=True)],
+            [m + s for m, s in zip(score, std, strict=True)],
+            'score_mean',
+        ),
+    ):
+        axes.grid(alpha=0.3)
+        if rows:
+            steps = column('step')
+            spread = 'worst to best' if axes is upper else 'standard deviation'
+            axes.fill_between(steps, low, high, color=colour, alpha=0.15, lw=0, label=spread)
+            axes.plot(steps, mean, 'o-', color=colour, markersize=4, label='mean')
+        else:
+            axes.text(0.5, 0.5, 'no evaluation', transform=axes.transAxes, ha='center')
+        if random:
+            axes.axhline(random[name], color='#555', ls='--', lw=1, label='random policy')
+        if rows or random:
+            axes.legend(loc='best', fontsize=8, framealpha=0.8)
     picture = io.BytesIO()
     figure.savefig(picture, format='png')
     return picture.getvalue()

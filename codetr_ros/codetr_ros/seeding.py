@@ -1,7 +1,7 @@
 """Random streams that depend on the run's seed and on what they are for, and on nothing else.
 
-Neither interleaving nor a restart changes what a part of the run draws: each slice of work seeds its
-generators from (seed, core, phase, slice), and no generator state is ever saved.
+Neither interleaving nor a restart changes what a part of the run draws: each slice of work seeds
+its generators from (seed, core, phase, slice), and no generator state is ever saved.
 """
 
 import hashlib

@@ -91,8 +91,9 @@ def find(name: str) -> Task:
         ) from None
     if not spec.max_episode_steps:
         raise TaskError(
-            f'task {name!r} has max_episode_steps={spec.max_episode_steps}, so no horizon: '
-            'register it with max_episode_steps, or choose a task that `codetr tasks` lists'
+            f'task {name!r}{_close_to(name, {})} has no horizon, its max_episode_steps is '
+            f'{spec.max_episode_steps}: register it with max_episode_steps, or choose a task that '
+            '`codetr tasks` lists'
         )
     note = 'r_max is not known: 1.0, unless the setting r_max gives another unit of scores'
     return Task(name, name, 'gymnasium', spec.max_episode_steps, 1.0, note)

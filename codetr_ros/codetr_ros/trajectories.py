@@ -1,8 +1,8 @@
 """The memory D: whole trajectories, their scored segments and their step rewards.
 
 Both the reward side and the learner keep one. Each observation is stored once; a step costs
-`Trajectories.bytes_per_step` bytes. What is added is checked against what is there, so that a wrong record is
-refused and changes nothing.
+`Trajectories.bytes_per_step` bytes. What is added is checked against what is there, so that a
+wrong record is refused and changes nothing.
 """
 
 from collections import deque
@@ -23,7 +23,9 @@ from codetr_ros.records import (
     TrueRewards,
 )
 
-_SOURCE_SHIFT = 40  # a segment id is (source index << 40) | number of the segment within its source
+_SOURCE_SHIFT = (
+    40  # a segment id is (source index << 40) | number of the segment within its source
+)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -62,7 +64,9 @@ class _Episode:
 class _Source:
     """The steps of one source, in a ring: row r lies in slot r % capacity, rows only grow."""
 
-    def __init__(self, name: str, observation_size: int, action_size: int, capacity: int, true_rewards: bool) -> None:
+    def __init__(
+        self, name: str, observation_size: int, action_size: int, capacity: int, true_rewards: bool
+    ) -> None:
         self.name = name
         self.capacity = capacity
         # np.empty takes memory page by page as steps arrive, not at once
@@ -71,13 +75,17 @@ class _Source:
         self.labels = np.empty(capacity, np.float32)  # NaN: not labelled
         self.versions = np.empty(capacity, np.uint32)
         self.terminated = np.empty(capacity, np.bool_)
-        self.last = np.empty(capacity, np.bool_)  # last step so far of its episode: next observation is in `finals`
+        self.last = np.empty(
+            capacity, np.bool_
+        )  # last step so far of its episode: next observation is in `finals`
         self.true_rewards = np.empty(capacity, np.float32) if true_rewards else None
         self.finals: dict[int, F32] = {}
         self.start = 0
         self.end = 0
         self.episodes: deque[_Episode] = deque()
-        self.newest: _Episode | None = None  # also where it has been evicted: the next steps follow on it
+        self.newest: _Episode | None = (
+            None  # also where it has been evicted: the next steps follow on it
+        )
         self.by_number: dict[int, _Episode] = {}
         # segments, grown by doubling; number n lies at n - first_segment
         self.first_segment = 0
@@ -96,8 +104,13 @@ class _Source:
     @property
     def arrays(self) -> tuple[NDArray[np.generic], ...]:
         rows: tuple[NDArray[np.generic], ...] = (
-            self.observations, self.actions, self.labels, self.versions, self.terminated, self.last,
-        )  # fmt: skip
+            self.observations,
+            self.actions,
+            self.labels,
+            self.versions,
+            self.terminated,
+            self.last,
+        )
         return rows if self.true_rewards is None else (*rows, self.true_rewards)
 
     def add_segment(self, row: int, length: int, offset: int, episode: int, value: float) -> int:
@@ -105,7 +118,11 @@ class _Source:
         for name in ('rows', 'lengths', 'offsets', 'episodes', 'values'):
             self._grow(f'segment_{name}', at)
         self._grow('alive', at)
-        self.segment_rows[at], self.segment_lengths[at], self.segment_offsets[at] = row, length, offset
+        self.segment_rows[at], self.segment_lengths[at], self.segment_offsets[at] = (
+            row,
+            length,
+            offset,
+        )
         self.segment_episodes[at], self.segment_values[at], self.alive[at] = episode, value, True
         self.segments += 1
         return self.first_segment + at
@@ -118,7 +135,11 @@ class _Source:
     def drop_segments(self, episode: _Episode) -> None:
         for number in episode.scored.values():
             self.alive[number - self.first_segment] = False
-        dead = int(np.argmax(self.alive[: self.segments])) if self.alive[: self.segments].any() else self.segments
+        dead = (
+            int(np.argmax(self.alive[: self.segments]))
+            if self.alive[: self.segments].any()
+            else self.segments
+        )
         if dead > self.segments // 2 and dead >= 64:
             for name in ('rows', 'lengths', 'offsets', 'episodes', 'values'):
                 array = getattr(self, f'segment_{name}')
@@ -136,7 +157,8 @@ class Trajectories:
         action_size: A.
         delay: steps n of a segment.
         capacity: steps after which `evict` drops the oldest episodes.
-        margin: steps that may be held beyond the capacity before `evict` is called: a phase and an episode.
+        margin: steps that may be held beyond the capacity before `evict` is called: a phase and an
+            episode.
         true_rewards: keep the environment's own rewards too, for the oracle.
     """
 
@@ -161,7 +183,8 @@ class Trajectories:
         self._sampleable: tuple[NDArray[np.int64], list[_Source]] | None = None
         self._ids: I64 | None = None
 
-    # ------------------------------------------------------------------------------------------ adding
+    # ------------------------------------------------------------------------------------------
+    # adding
 
     def append(self, chunk: Transitions) -> None:
         """Add consecutive steps that go on where their source's last ones ended.
@@ -172,12 +195,17 @@ class Trajectories:
         source = self._sources.get(chunk.source)
         if source is None:
             source = _Source(
-                chunk.source, self.observation_size, self.action_size, self.capacity + self._margin, self._true_rewards
+                chunk.source,
+                self.observation_size,
+                self.action_size,
+                self.capacity + self._margin,
+                self._true_rewards,
             )
             self._sources[chunk.source] = source
         if source.steps + chunk.steps > source.capacity:
             raise RecordError(
-                f'{chunk.steps} steps of {chunk.source!r} exceed the memory: {source.steps} of {source.capacity} rows are '
+                f'{chunk.steps} steps of {chunk.source!r} exceed the memory: {source.steps} of '
+                f'{source.capacity} rows are '
                 f'taken. Raise memory_steps ({self.capacity})'
             )
         episode = self._episode_of(source, chunk)
@@ -206,14 +234,17 @@ class Trajectories:
             expected = (last.number + 1, 0) if last.ended else (last.number, last.steps)
         if (chunk.episode, chunk.first_step) != expected:
             raise RecordError(
-                f'transitions out of sequence: {chunk.source!r} sent episode {chunk.episode} step {chunk.first_step} '
-                f'(sequence {chunk.sequence}); episode {expected[0]} step {expected[1]} follows on what is here. '
+                f'transitions out of sequence: {chunk.source!r} sent episode {chunk.episode} step '
+                f'{chunk.first_step} '
+                f'(sequence {chunk.sequence}); episode {expected[0]} step {expected[1]} follows '
+                'on what is here. '
                 f'Restart the source, or send what lies between'
             )
         if last is not None and not last.ended:
             if not np.array_equal(source.finals[source.end - 1], chunk.observations[0]):
                 raise RecordError(
-                    f'transitions of {chunk.source!r}, episode {chunk.episode}, step {chunk.first_step}: the first '
+                    f'transitions of {chunk.source!r}, episode {chunk.episode}, step '
+                    f'{chunk.first_step}: the first '
                     f'observation is not the one that the steps before ended with'
                 )
             return last
@@ -225,11 +256,15 @@ class Trajectories:
         return episode
 
     def append_true_rewards(self, record: TrueRewards) -> None:
-        """Add the environment's own rewards of steps that are here: for the oracle, never in a node."""
+        """Add the environment's own rewards of steps that are here: for the oracle, never in a
+        node.
+        """
         source = self._sources[record.source]
         assert source.true_rewards is not None, 'this memory was made without true rewards'
         start = source.by_number[record.episode].start + record.first_step
-        source.true_rewards[np.arange(start, start + len(record.rewards)) % source.capacity] = record.rewards
+        source.true_rewards[np.arange(start, start + len(record.rewards)) % source.capacity] = (
+            record.rewards
+        )
 
     def score(self, reward: CompositeReward) -> None:
         """Add the composite reward of a segment whose steps are here.
@@ -238,36 +273,51 @@ class Trajectories:
             RecordError: there is no such segment, or it has its reward already.
         """
         named = (
-            f'composite reward {reward.value} of {reward.scorer!r} for {reward.source!r}, episode {reward.episode}, '
+            f'composite reward {reward.value} of {reward.scorer!r} for {reward.source!r}, episode '
+            f'{reward.episode}, '
             f'first_step {reward.first_step}, length {reward.length}'
         )
         source = self._sources.get(reward.source)
         episode = source.by_number.get(reward.episode) if source else None
         if source is None or episode is None:
-            raise RecordError(f'{named}: no such episode is here (never sent, or evicted); score segments of steps sent')
+            raise RecordError(
+                f'{named}: no such episode is here (never sent, or evicted); score segments of '
+                'steps sent'
+            )
         last = reward.first_step + reward.length
         whole = reward.length == self.delay
         cut_short = episode.ended and last == episode.steps and 0 < reward.length < self.delay
         if reward.first_step % self.delay or last > episode.steps or not (whole or cut_short):
             raise RecordError(
-                f'{named}: there is no such segment. Segments have {self.delay} steps, start at multiples of '
-                f'{self.delay} and only the last of an ended episode is shorter; this episode has {episode.steps} steps'
+                f'{named}: there is no such segment. Segments have {self.delay} steps, start at '
+                'multiples of '
+                f'{self.delay} and only the last of an ended episode is shorter; this episode has '
+                f'{episode.steps} steps'
                 f'{" and ended" if episode.ended else ""}'
             )
         if reward.first_step in episode.scored:
-            raise RecordError(f'{named}: the segment has its composite reward already; the first one is kept')
+            raise RecordError(
+                f'{named}: the segment has its composite reward already; the first one is kept'
+            )
         episode.scored[reward.first_step] = source.add_segment(
-            episode.start + reward.first_step, reward.length, reward.first_step, reward.episode, reward.value
+            episode.start + reward.first_step,
+            reward.length,
+            reward.first_step,
+            reward.episode,
+            reward.value,
         )
         self._ids = None
 
     def evict(self) -> int:
-        """Drop whole episodes, oldest first, until at most `capacity` steps are held; how many steps went.
+        """Drop whole episodes, oldest first, until at most `capacity` steps are held; how many
+        steps went.
 
         The last episode of all is kept however long it is: an empty memory teaches nothing.
         """
         gone = 0
-        while self.steps > self.capacity and sum(len(s.episodes) for s in self._sources.values()) > 1:
+        while (
+            self.steps > self.capacity and sum(len(s.episodes) for s in self._sources.values()) > 1
+        ):
             ended = [s for s in self._sources.values() if s.episodes and s.episodes[0].ended]
             if not ended:
                 break  # unfinished episodes are all there is: they must not be cut
@@ -294,12 +344,20 @@ class Trajectories:
             return 0
         source = self._sources.get(rewards.source)
         if source is None:
-            raise RecordError(f'step rewards for {rewards.source!r}, which sent no steps; sources: {list(self._sources)}')
+            raise RecordError(
+                f'step rewards for {rewards.source!r}, which sent no steps; sources: '
+                f'{list(self._sources)}'
+            )
         starts = np.empty(len(rewards.lengths), np.int64)
         newest = source.newest.number if source.newest else -1
         known = source.by_number
         gone = np.zeros(len(starts), np.bool_)
-        triples = zip(rewards.episodes.tolist(), rewards.first_steps.tolist(), rewards.lengths.tolist(), strict=True)
+        triples = zip(
+            rewards.episodes.tolist(),
+            rewards.first_steps.tolist(),
+            rewards.lengths.tolist(),
+            strict=True,
+        )
         for i, (number, first, length) in enumerate(triples):
             episode = known.get(number)
             if episode is None and number <= newest:
@@ -307,7 +365,8 @@ class Trajectories:
                 starts[i] = 0
             elif episode is None or first + length > episode.steps:
                 raise RecordError(
-                    f'step rewards of phase {rewards.phase} for {rewards.source!r}, episode {number}, first_step {first}, '
+                    f'step rewards of phase {rewards.phase} for {rewards.source!r}, episode '
+                    f'{number}, first_step {first}, '
                     f'length {length}: these steps are not here'
                 )
             else:
@@ -320,7 +379,8 @@ class Trajectories:
         self._sampleable = None
         return int(np.count_nonzero(~keep))
 
-    # ------------------------------------------------------------------------------------------ asking
+    # ------------------------------------------------------------------------------------------
+    # asking
 
     @property
     def steps(self) -> int:
@@ -334,13 +394,17 @@ class Trajectories:
 
     @property
     def bytes_per_step(self) -> int:
-        """Bytes that one stored step takes: observation, action, label, its model version, two flags."""
+        """Bytes that one stored step takes: observation, action, label, its model version, two
+        flags.
+        """
         per_row = 4 * self.observation_size + 4 * self.action_size + 4 + 4 + 1 + 1
         return per_row + (4 if self._true_rewards else 0)
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the rows in use, with each episode's final observation and the table of segments."""
+        """Bytes of the rows in use, with each episode's final observation and the table of
+        segments.
+        """
         total = 0
         for s in self._sources.values():
             total += min(s.end, s.capacity) * self.bytes_per_step
@@ -358,7 +422,10 @@ class Trajectories:
 
     def labels(self) -> dict[str, F32]:
         """The labels of each source's steps, in order; NaN where there is none."""
-        return {s.name: s.labels[np.arange(s.start, s.end) % s.capacity] for s in self._sources.values()}
+        return {
+            s.name: s.labels[np.arange(s.start, s.end) % s.capacity]
+            for s in self._sources.values()
+        }
 
     def sample_steps(self, rng: np.random.Generator, batch: int) -> StepBatch:
         """Draw labelled steps uniformly, with replacement.
@@ -423,7 +490,9 @@ class Trajectories:
             self._ids = np.concatenate(parts) if parts else np.empty(0, np.int64)
         return self._ids
 
-    def sample_segments(self, rng: np.random.Generator, batch: int, context: int = 0) -> SegmentBatch:
+    def sample_segments(
+        self, rng: np.random.Generator, batch: int, context: int = 0
+    ) -> SegmentBatch:
         """Draw scored segments uniformly, with replacement.
 
         Raises:
@@ -436,20 +505,24 @@ class Trajectories:
 
     def segment_batch(self, ids: I64, context: int = 0) -> SegmentBatch:
         """Segments by id, each with up to `context` steps of its episode before it."""
-        rows, lengths, offsets, values = (np.empty(len(ids), d) for d in (np.int64, np.int64, np.int64, np.float64))
+        spans = self._spans(ids)
+        rows, lengths, offsets = spans[:, 0], spans[:, 1], spans[:, 2]
+        values = np.empty(len(ids), np.float64)
         for _, source, mine, at in self._by_source(ids):
-            rows[mine], lengths[mine] = source.segment_rows[at], source.segment_lengths[at]
-            offsets[mine], values[mine] = source.segment_offsets[at], source.segment_values[at]
+            values[mine] = source.segment_values[at]
         before = np.minimum(context, offsets)
         return self._windows(ids, rows - before, lengths + before, before, values)
 
     def windows(self, ids: I64, window: int, batch: int) -> Iterator[SegmentBatch]:
-        """For each step of the segments, in order, the last `window` steps of its episode that end with it.
+        """For each step of the segments, in order, the last `window` steps of its episode that end
+        with it.
 
         `context` counts the steps of a window that precede the segment of its last step.
         """
         rows, owners, contexts, lengths = [], [], [], []
-        for segment, (row, length, offset) in zip(ids.tolist(), self._spans(ids).tolist(), strict=True):
+        for segment, (row, length, offset) in zip(
+            ids.tolist(), self._spans(ids).tolist(), strict=True
+        ):
             steps = np.arange(length)
             size = np.minimum(window, offset + steps + 1)
             rows.append(row + steps + 1 - size)
@@ -463,19 +536,33 @@ class Trajectories:
         for i in range(0, len(all_rows), batch):
             part = slice(i, i + batch)
             nothing = np.full(len(all_rows[part]), np.nan)
-            yield self._windows(all_owners[part], all_rows[part], all_lengths[part], all_contexts[part], nothing)
+            yield self._windows(
+                all_owners[part], all_rows[part], all_lengths[part], all_contexts[part], nothing
+            )
 
     def segments(self, ids: I64) -> list[tuple[str, I64, I64, I64]]:
-        """Where segments lie: for each source its name, and the episodes, first steps and lengths of its ids."""
+        """Where segments lie: for each source its name, and the episodes, first steps and lengths
+        of its ids.
+        """
         return [
-            (source.name, source.segment_episodes[at], source.segment_offsets[at], source.segment_lengths[at])
+            (
+                source.name,
+                source.segment_episodes[at],
+                source.segment_offsets[at],
+                source.segment_lengths[at],
+            )
             for _, source, _, at in self._by_source(ids)
         ]
 
     def score_scale(self) -> float:
-        """Root mean square of the composite reward per step over all scored segments; 1 where that is 0."""
+        """Root mean square of the composite reward per step over all scored segments; 1 where that
+        is 0.
+        """
         squares = [
-            (s.segment_values[: s.segments] / s.segment_lengths[: s.segments])[s.alive[: s.segments]] ** 2
+            (s.segment_values[: s.segments] / s.segment_lengths[: s.segments])[
+                s.alive[: s.segments]
+            ]
+            ** 2
             for s in self._sources.values()
         ]
         values = np.concatenate(squares) if squares else np.empty(0)
@@ -483,8 +570,14 @@ class Trajectories:
         return scale if scale > 0 else 1.0
 
     def observation_moments(self) -> tuple[F64, F64]:
-        """Mean and standard deviation of each observation component over all steps held, in float64."""
-        parts = [s.observations[np.arange(s.start, s.end) % s.capacity] for s in self._sources.values() if s.steps]
+        """Mean and standard deviation of each observation component over all steps held, in
+        float64.
+        """
+        parts = [
+            s.observations[np.arange(s.start, s.end) % s.capacity]
+            for s in self._sources.values()
+            if s.steps
+        ]
         if not parts:
             return np.zeros(self.observation_size), np.ones(self.observation_size)
         rows = np.concatenate(parts).astype(np.float64)
@@ -495,7 +588,12 @@ class Trajectories:
         for index in np.unique(ids >> _SOURCE_SHIFT).tolist():
             source = self._sources[names[index]]
             mine = np.flatnonzero(ids >> _SOURCE_SHIFT == index)
-            yield index, source, mine, (ids[mine] & ((1 << _SOURCE_SHIFT) - 1)) - source.first_segment
+            yield (
+                index,
+                source,
+                mine,
+                (ids[mine] & ((1 << _SOURCE_SHIFT) - 1)) - source.first_segment,
+            )
 
     def _spans(self, ids: I64) -> I64:
         spans = np.empty((len(ids), 3), np.int64)
@@ -504,7 +602,9 @@ class Trajectories:
             spans[mine, 2] = source.segment_offsets[at]
         return spans
 
-    def _windows(self, ids: I64, rows: I64, lengths: I64, context: I64, values: F64) -> SegmentBatch:
+    def _windows(
+        self, ids: I64, rows: I64, lengths: I64, context: I64, values: F64
+    ) -> SegmentBatch:
         steps = int(lengths.max())
         grid = rows[:, None] + np.arange(steps + 1)  # (B, L+1)
         inside = np.arange(steps + 1) <= lengths[:, None]

@@ -1,4 +1,4 @@
-"""`ros2 run learner_node learner`: makes the run, permits its phases, learns the policy from labelled steps."""
+"""`ros2 run learner_node learner`: makes the run, permits its phases, learns from labels."""
 
 import sys
 from typing import TYPE_CHECKING
@@ -11,9 +11,10 @@ if TYPE_CHECKING:
 
 def load() -> 'MakeCore':
     """Import the core and return what makes it."""
+    import torch._dynamo  # noqa: F401 - the first optimiser imports it: seconds, amid the run
     from codetr_ros.learners.core import Learner
 
-    return lambda run, settings, name, folder: Learner(run, settings, name, folder)
+    return Learner
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""`ros2 run reward_node reward`: learns the reward model from composite rewards and labels steps."""
+"""`ros2 run reward_node reward`: learns from composite rewards and labels steps."""
 
 import sys
 from typing import TYPE_CHECKING
@@ -11,9 +11,10 @@ if TYPE_CHECKING:
 
 def load() -> 'MakeCore':
     """Import the core and return what makes it."""
+    import torch._dynamo  # noqa: F401 - the first optimiser imports it: seconds, amid the run
     from codetr_ros.rewards.core import Labeller
 
-    return lambda run, settings, name, folder: Labeller(run, settings, name, folder)
+    return Labeller
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -1,1 +1,3 @@
-"""Bags: written as MCAP with `ros2 bag`'s own layout, so that its tools, rosbags and Foxglove open them. No ROS needed."""
+"""Bags: written as MCAP with `ros2 bag`'s own layout, so that its tools, rosbags and Foxglove open
+them. No ROS needed.
+"""

@@ -1,9 +1,10 @@
 """Writes a bag that loses nothing which was flushed: MCAP in small chunks, each with its CRC.
 
-A bag is a folder of MCAP files and a `metadata.yaml` (rosbag2's version 9), written last. The layout is
-rosbag2's: profile `ros2`, schemas as .msg text with all that they contain, `offered_qos_profiles` and
-`topic_type_hash` at each channel. A process that is killed leaves a file without index and a folder without
-metadata: every flushed message can still be read from it in order (`mcap.stream_reader`).
+A bag is a folder of MCAP files and a `metadata.yaml` (rosbag2's version 9), written last. The
+layout is rosbag2's: profile `ros2`, schemas as .msg text with all that they contain,
+`offered_qos_profiles` and `topic_type_hash` at each channel. A process that is killed leaves a
+file without index and a folder without metadata: every flushed message can still be read from it
+in order (`mcap.stream_reader`).
 
 Messages are taken as the CDR bytes that came: nothing is decoded, so nothing can change.
 """
@@ -25,13 +26,16 @@ from mcap.writer import CompressionType, Writer
 from codetr_ros.run_folder import atomic_write, sync_folder
 
 CHUNK_BYTES = 64 * 1024
-"""Size at which a chunk is closed by itself: what a killed process can lose of messages not yet flushed."""
+"""Size at which a chunk is closed by itself: what a killed process can lose of messages not yet
+flushed."""
 METADATA = 'metadata.yaml'
 _FOREVER = {'sec': 9223372036, 'nsec': 854775807}
 
 
 class BagError(RuntimeError):
-    """A bag that cannot be written or set up: names the file or the type, the reason and the remedy."""
+    """A bag that cannot be written or set up: names the file or the type, the reason and the
+    remedy.
+    """
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,9 @@ class BagTopic:
     transient_local: bool
 
     def qos(self) -> list[dict[str, Any]]:
-        """The QoS it was offered with, as rosbag2 writes it (so that `ros2 bag play` offers the same)."""
+        """The QoS it was offered with, as rosbag2 writes it (so that `ros2 bag play` offers the
+        same).
+        """
         return [
             {
                 'history': 'keep_last',
@@ -73,7 +79,8 @@ def _interface_file(package: str, name: str, suffix: str) -> Path:
             return path
     searched = ', '.join(str(share) for share in _share_folders())
     raise BagError(
-        f'no {suffix} file of {package}/msg/{name} in {searched}: build the workspace, or source its setup file'
+        f'no {suffix} file of {package}/msg/{name} in {searched}: build the workspace, or '
+        f'source its setup file'
     )
 
 
@@ -148,7 +155,9 @@ class McapWriter:
         BagError: the folder holds something or cannot be made, or a type is not installed.
     """
 
-    def __init__(self, folder: Path, topics: Iterable[BagTopic], chunk_bytes: int = CHUNK_BYTES) -> None:
+    def __init__(
+        self, folder: Path, topics: Iterable[BagTopic], chunk_bytes: int = CHUNK_BYTES
+    ) -> None:
         self.folder = folder
         self.counts: Counter[str] = Counter()
         self._topics = {topic.name: topic for topic in topics}
@@ -159,11 +168,16 @@ class McapWriter:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             if found := sorted(p.name for p in folder.iterdir()):
-                raise BagError(f'bag {folder} exists and holds {found[0]}: choose another folder, or remove it')
+                raise BagError(
+                    f'bag {folder} exists and holds {found[0]}: choose another folder, or '
+                    f'remove it'
+                )
             self._open_file()
             sync_folder(folder)
         except OSError as error:
-            raise BagError(f'bag {folder} cannot be made: {error.strerror}; choose another folder') from error
+            raise BagError(
+                f'bag {folder} cannot be made: {error.strerror}; choose another folder'
+            ) from error
 
     @property
     def size(self) -> int:
@@ -171,12 +185,17 @@ class McapWriter:
         return self._good if self._stream.closed else self._stream.tell()
 
     def _open_file(self) -> None:
-        """Begin the bag's next file. Schemas and channels are written to each, so that each can be read alone."""
+        """Begin the bag's next file. Schemas and channels are written to each, so that each can be
+        read alone.
+        """
         info = _FileInfo(f'{self.folder.name}_{len(self._files)}.mcap')
         self._stream = (self.folder / info.name).open('xb')
         self._files.append(info)
-        self._writer = Writer(
-            self._stream, chunk_size=self._chunk_bytes, compression=CompressionType.NONE, enable_crcs=True
+        self._writer: Any = Writer(  # its methods carry no types
+            self._stream,
+            chunk_size=self._chunk_bytes,
+            compression=CompressionType.NONE,
+            enable_crcs=True,
         )
         self._writer.start(profile='ros2', library='codetr_ros')
         self._channels: dict[str, int] = {}
@@ -197,7 +216,9 @@ class McapWriter:
             )
         self._flush()
 
-    def write(self, topic: str, data: bytes, log_time: int, publish_time: int | None = None) -> None:
+    def write(
+        self, topic: str, data: bytes, log_time: int, publish_time: int | None = None
+    ) -> None:
         """Append a message.
 
         Args:
@@ -207,7 +228,8 @@ class McapWriter:
             publish_time: when it was published [ns]; as received where not known.
 
         Raises:
-            BagError: it cannot be written. The bag is then closed, and holds what had been flushed.
+            BagError: it cannot be written. The bag is then closed, and holds what had been
+                flushed.
         """
         info = self._files[-1]
         try:
@@ -231,7 +253,8 @@ class McapWriter:
         """End the open chunk and wait until everything is on the disk.
 
         Raises:
-            BagError: it cannot be written. The bag is then closed, and holds what had been flushed before.
+            BagError: it cannot be written. The bag is then closed, and holds what had been flushed
+                before.
         """
         try:
             self._flush()
@@ -239,14 +262,19 @@ class McapWriter:
             raise self._broken(error) from error
 
     def _broken(self, error: OSError) -> BagError:
-        """Cut the file back to the last whole chunk: half a chunk would spoil what comes before it for some readers."""
+        """Cut the file back to the last whole chunk: half a chunk would spoil what comes before it
+        for some readers.
+        """
         self.closed = True
         path = self.folder / self._files[-1].name
-        with suppress(OSError):  # closing tries to write the buffer once more; the file is closed all the same
+        with suppress(
+            OSError
+        ):  # closing tries to write the buffer once more; the file is closed all the same
             self._stream.close()
         os.truncate(path, self._good)
         return BagError(
-            f'bag {path} cannot be written: {error.strerror}. It holds the {self._good} bytes flushed before, '
+            f'bag {path} cannot be written: {error.strerror}. It holds the {self._good} bytes '
+            f'flushed before, '
             f'without an index. Make room, and start the run again in another folder'
         )
 
@@ -271,7 +299,8 @@ class McapWriter:
             if not self._stream.closed:
                 raise self._broken(error) from error
             raise BagError(
-                f'bag {self.folder} is whole but {METADATA} cannot be written: {error.strerror}; make room and reindex it'
+                f'bag {self.folder} is whole but {METADATA} cannot be written: '
+                f'{error.strerror}; make room and reindex it'
             ) from error
 
     def _metadata(self) -> str:

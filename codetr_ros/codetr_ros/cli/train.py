@@ -159,7 +159,7 @@ def _in_process(
     except KeyboardInterrupt:
         progress.say('stopped')
         return Outcome(run_folder.read_reports(folder), interrupted=True)
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001
         # Whatever it was: what was learnt until now is worth a summary, which names the failure.
         log = folder / run_folder.LOGS / 'in_process.log'
         run_folder.atomic_write(log, traceback.format_exc())
@@ -203,10 +203,15 @@ def _over_topics(
         try:
             # The watcher first: what the nodes say from their start on is to be heard.
             with Watcher(receive, f'/run_{run_id}') as watcher:
+
+                def poll() -> None:
+                    watcher.poll(0.1)
+                    progress.tick()
+
                 processes.start(commands, folder / run_folder.LOGS, environment)
                 failure = supervise(
                     processes,
-                    lambda: watcher.poll(0.1),
+                    poll,
                     interrupts,
                     silence,
                     lambda node: why_it_gave_up(node, folder),

@@ -1,4 +1,6 @@
-"""The learner's part of Algorithm 1: permit a phase, take it in, learn from its labels, permit the next."""
+"""The learner's part of Algorithm 1: permit a phase, take it in, learn from its labels, permit the
+next.
+"""
 
 import time
 from collections import Counter
@@ -41,7 +43,7 @@ class Learner:
         folder: where checkpoints go; None keeps none.
     """
 
-    subscribes = (TaskSpec, Transitions, Commit, StepRewards)
+    subscribes: tuple[type, ...] = (TaskSpec, Transitions, Commit, StepRewards)
 
     def __init__(self, run: RunSpec, settings: Settings, name: str, folder: Path | None) -> None:
         self._run = run
@@ -76,10 +78,14 @@ class Learner:
         check_run(record, self._run)
         if len(record.labels) != int(record.lengths.sum()):
             raise RecordError(
-                f'{describe(record)}: {len(record.labels)} labels for segments of {int(record.lengths.sum())} steps'
+                f'{describe(record)}: {len(record.labels)} labels for segments of '
+                f'{int(record.lengths.sum())} steps'
             )
         if not np.isfinite(record.labels).all():
-            raise RecordError(f'{describe(record)}: labels[{int(np.argmin(np.isfinite(record.labels)))}] is not finite')
+            raise RecordError(
+                f'{describe(record)}: labels[{int(np.argmin(np.isfinite(record.labels)))}] is not '
+                'finite'
+            )
         parts = self._labels.setdefault(record.phase, {})
         if record.phase < self._phase or record.part in parts:
             self._duplicated[TOPICS[StepRewards]] += 1
@@ -109,7 +115,8 @@ class Learner:
                     yield None
                 for _, part in sorted(self._labels.pop(phase).items()):
                     self._counters['labels of evicted steps'] += memory.apply(part)
-                for metrics in self._learn(phase, memory, sac):
+                for said in self._learn(phase, memory, sac):
+                    metrics |= said
                     yield []
             metrics |= {
                 'updates': self._updates,
@@ -119,7 +126,17 @@ class Learner:
             }
             self._phase = phase + 1
             # the permission first: while it travels, the checkpoint is written
-            yield [self._permit(phase + settings.lag, phase), records.metrics(self._run.run_id, 'learner', self._name, phase, settings.steps_after(phase), metrics)]
+            yield [
+                self._permit(phase + settings.lag, phase),
+                records.metrics(
+                    self._run.run_id,
+                    'learner',
+                    self._name,
+                    phase,
+                    settings.steps_after(phase),
+                    metrics,
+                ),
+            ]
             if phase >= settings.warmup_phases - 1:
                 self.close()
                 yield []
@@ -128,7 +145,7 @@ class Learner:
             yield None
 
     def _labelled(self, phase: int) -> bool:
-        parts = self._labels.get(phase)
+        parts = self._labels.get(phase, {})
         return bool(parts) and len(parts) == next(iter(parts.values())).parts
 
     def _learn(self, phase: int, memory: Trajectories, sac: SAC) -> Iterator[dict[str, float]]:
@@ -171,13 +188,20 @@ class Learner:
             sources,
             np.array(shares, np.uint32),
             random,
-            '' if random else network.describe(spec.observation_size, spec.action_size, settings.sac.hidden),
+            ''
+            if random
+            else network.describe(spec.observation_size, spec.action_size, settings.sac.hidden),
             b'' if random else network.weights_bytes(self._sac.actor),
         )
 
     def close(self) -> None:
-        """Save a checkpoint of the last finished phase, if there is a folder and none was saved."""
-        if self._folder is None or self._sac is None or self._memory is None or self._saved == self._phase - 1:
+        """Save a checkpoint of the last finished phase, unless there is one or no folder."""
+        if (
+            self._folder is None
+            or self._sac is None
+            or self._memory is None
+            or self._saved == self._phase - 1
+        ):
             return
         tensors = dict(self._sac.state())
         for source, labels in self._memory.labels().items():

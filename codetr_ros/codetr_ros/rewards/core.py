@@ -1,4 +1,6 @@
-"""The reward node's part of Algorithm 1: take a phase in, fit the reward model, label, say what changed."""
+"""The reward node's part of Algorithm 1: take a phase in, fit the reward model, label, say what
+changed.
+"""
 
 import time
 from collections import Counter
@@ -99,7 +101,8 @@ class Labeller:
             if phase == settings.warmup_phases - 1:
                 method.prepare(memory)
             metrics: dict[str, float] = {}
-            for metrics in self._fit(phase, memory, method):
+            for said in self._fit(phase, memory, method):
+                metrics |= said
                 yield []
             began = time.perf_counter()
             parts: list[StepRewards] = []
@@ -172,22 +175,37 @@ class Labeller:
     ) -> list[StepRewards]:
         found = []
         at = 0
-        for source, episodes, firsts, lengths in memory.segments(ids):  # ids are ordered by source
-            while len(lengths):
-                fit = int(np.searchsorted(np.cumsum(lengths * 4 + 12), PART_BYTES, side='right'))
-                n = max(1, fit)
-                steps = int(lengths[:n].sum())
-                arrays = [a[:n].astype(np.uint32) for a in (episodes, firsts, lengths)]
+        for source, *where in memory.segments(ids):  # ids are ordered by source
+            lengths = where[2]
+            begin = 0
+            while begin < len(lengths):
+                sizes = np.cumsum(lengths[begin:] * 4 + 12)
+                end = begin + max(1, int(np.searchsorted(sizes, PART_BYTES, side='right')))
+                steps = int(lengths[begin:end].sum())
+                episodes, firsts, counts = (a[begin:end].astype(np.uint32) for a in where)
                 part = labels[at : at + steps].copy()
                 found.append(
-                    StepRewards(self._run.run_id, phase, version, 0, 0, source, *arrays, part)
+                    StepRewards(
+                        self._run.run_id,
+                        phase,
+                        version,
+                        0,
+                        0,
+                        source,
+                        episodes,
+                        firsts,
+                        counts,
+                        part,
+                    )
                 )
                 at += steps
-                episodes, firsts, lengths = episodes[n:], firsts[n:], lengths[n:]
+                begin = end
         return found
 
     def _numbered(self, phase: int, version: int, found: list[StepRewards]) -> list[StepRewards]:
-        """Join small batches into parts as large as may be, and number them; at least one, if empty."""
+        """Join small batches into parts as large as may be, and number them; at least one, if
+        empty.
+        """
         parts: list[list[StepRewards]] = []
         size = PART_BYTES
         for piece in found:
@@ -221,7 +239,7 @@ class Labeller:
         ]
 
     def close(self) -> None:
-        """Save a checkpoint of the last finished phase, if there is a folder and none was saved."""
+        """Save a checkpoint of the last finished phase, unless there is one or no folder."""
         done = self._phase - 1
         if self._folder is None or self._method is None or self._saved == done:
             return

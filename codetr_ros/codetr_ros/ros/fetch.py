@@ -26,7 +26,8 @@ def unpack(response: Any) -> list[Record]:
     lengths = list(response.lengths)
     if len(lengths) != len(response.types) or sum(lengths) != len(response.cdr):
         raise RecordError(
-            f'{SERVICE}: {len(response.types)} types, {len(lengths)} lengths of {sum(lengths)} bytes and '
+            f'{SERVICE}: {len(response.types)} types, {len(lengths)} lengths of {sum(lengths)} '
+            f'bytes and '
             f'{len(response.cdr)} bytes disagree: update the recorder'
         )
     data = bytes(response.cdr)
@@ -36,7 +37,9 @@ def unpack(response: Any) -> list[Record]:
         if kind not in messages.RECORD_TYPES:
             raise RecordError(f'{SERVICE}: {kind!r} is not a type of record: update the recorder')
         message_type = messages.message_type(messages.RECORD_TYPES[kind])
-        found.append(messages.from_message(deserialize_message(data[end - length : end], message_type)))
+        found.append(
+            messages.from_message(deserialize_message(data[end - length : end], message_type))
+        )
     return found
 
 
@@ -72,10 +75,14 @@ class Fetcher:
         self._due = now + AGAIN
         log = self._link.node.get_logger()
         if not self._client.service_is_ready():
-            log.warning(f'phase {missing} is incomplete, and no recorder offers {self._client.srv_name!r}')
+            log.warning(
+                f'phase {missing} is incomplete, and no recorder offers {self._client.srv_name!r}'
+            )
             return
         log.warning(f'phase {missing} is incomplete: asking the recorder for it')
-        request = FetchPhase.Request(run_id=self._run_id, phase=missing, requester=self._link.full_name)
+        request = FetchPhase.Request(
+            run_id=self._run_id, phase=missing, requester=self._link.full_name
+        )
         future = self._client.call_async(request)
         future.add_done_callback(lambda done: self._link.store(self._arrived, missing, done))
 

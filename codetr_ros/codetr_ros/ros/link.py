@@ -1,7 +1,9 @@
-"""A node's connection to ROS: one rclpy node, its executor, its topics. Callbacks only store; the main loop takes.
+"""A node's connection to ROS: one rclpy node, its executor, its topics. Callbacks only store; the
+main loop takes.
 
-The executor is the events executor: its `spin_once` runs exactly one callback, so arriving messages are drained until
-the count of callbacks stands still; blocking in it costs nothing (0.3 % of a core at 50 ms) and a message wakes it.
+The executor is the events executor: its `spin_once` runs exactly one callback, so arriving
+messages are drained until the count of callbacks stands still; blocking in it costs nothing (0.3 %
+of a core at 50 ms) and a message wakes it.
 """
 
 import time
@@ -55,9 +57,14 @@ class Link:
         self.inbox.append(lambda: handle(*arguments))
 
     def subscribe(
-        self, record_type: type, handle: Callable[..., None], settings: Settings | None = None, raw: bool = False
+        self,
+        record_type: type,
+        handle: Callable[..., None],
+        settings: Settings | None = None,
+        raw: bool = False,
     ) -> None:
-        """Have `handle(record_type, message)` called by the main loop for each message on a record's topic.
+        """Have `handle(record_type, message)` called by the main loop for each message on a
+        record's topic.
 
         Args:
             record_type: whose topic.
@@ -100,7 +107,11 @@ class Link:
             for topic, n in sorted(by_topic.items())
         ]
         status = DiagnosticStatus(
-            level=level, name=f'{self.full_name}: messages', message=message, hardware_id=self.name, values=values
+            level=level,
+            name=f'{self.full_name}: messages',
+            message=message,
+            hardware_id=self.name,
+            values=values,
         )
         stamp = self.node.get_clock().now().to_msg()
         array = DiagnosticArray(status=[status])
@@ -121,8 +132,11 @@ class Link:
             if self._events == seen:
                 return
 
-    def unmatched(self, topics: Iterable[str], names: Callable[[str], set[str]], readers: bool) -> list[str]:
-        """Which nodes, of those that should read (or write) our topics, the middleware has not matched yet.
+    def unmatched(
+        self, topics: Iterable[str], names: Callable[[str], set[str]], readers: bool
+    ) -> list[str]:
+        """Which nodes, of those that should read (or write) our topics, the middleware has not
+        matched yet.
 
         Args:
             topics: relative names.
@@ -133,14 +147,26 @@ class Link:
         for topic in topics:
             wanted = names(topic)
             full = self.node.resolve_topic_name(topic)
-            ask = self.node.get_subscriptions_info_by_topic if readers else self.node.get_publishers_info_by_topic
-            there = {f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in ask(full)} if wanted else set()
+            ask = (
+                self.node.get_subscriptions_info_by_topic
+                if readers
+                else self.node.get_publishers_info_by_topic
+            )
+            there = (
+                {f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in ask(full)}
+                if wanted
+                else set()
+            )
             verb = 'reads' if readers else 'publishes'
-            found += [f'{name} (not seen yet that it {verb} {full!r})' for name in sorted(wanted - there)]
+            found += [
+                f'{name} (not seen yet that it {verb} {full!r})' for name in sorted(wanted - there)
+            ]
         return found
 
     def wait_acked(self, deadline: float) -> list[str]:
-        """Wait until the readers have everything that was published; returns the topics on which they have not."""
+        """Wait until the readers have everything that was published; returns the topics on which
+        they have not.
+        """
         end = time.monotonic() + deadline
         late = []
         for topic, publisher in self._publishers.items():

@@ -1,8 +1,9 @@
-"""Records to messages and back, generically: a message has the fields of its record, and a `stamp`.
+"""Records to messages and back, generically: a message has the fields of its record, and a
+`stamp`.
 
-The fields' types come from the generated message classes, so that a field added to both a record and its
-message needs nothing here. Arrays leave as `array.array` (numpy would be copied element by element: 100 ms
-instead of 0.04 ms for a policy) and arrive as numpy arrays in memory of our own.
+The fields' types come from the generated message classes, so that a field added to both a record
+and its message needs nothing here. Arrays leave as `array.array` (numpy would be copied element by
+element: 100 ms instead of 0.04 ms for a policy) and arrive as numpy arrays in memory of our own.
 """
 
 import re
@@ -103,7 +104,8 @@ def _fields(record_type: type) -> tuple[_Field, ...]:
     names = [f.name for f in fields(record_type)]
     if ['stamp', *names] != list(types):
         raise TypeError(
-            f'{type_name(record_type)} has fields {list(types)}, its record {names}: build the workspace again'
+            f'{type_name(record_type)} has fields {list(types)}, its record {names}: build the '
+            f'workspace again'
         )
     found = []
     for name in names:
@@ -123,7 +125,9 @@ def _fields(record_type: type) -> tuple[_Field, ...]:
             plain = bool if kind == 'boolean' else str
             found.append(_Field(name, plain, plain))
         else:
-            raise TypeError(f'{type_name(record_type)}.{name}: no record has a field of type {kind}')
+            raise TypeError(
+                f'{type_name(record_type)}.{name}: no record has a field of type {kind}'
+            )
     return tuple(found)
 
 
@@ -143,7 +147,9 @@ def to_message(record: Record, stamp: Time) -> Any:
         try:
             setattr(message, field.name, field.outward(getattr(record, field.name)))
         except (ValueError, TypeError, OverflowError) as error:
-            raise RecordError(f'{type(record).__name__}.{field.name} cannot be sent: {error}') from None
+            raise RecordError(
+                f'{type(record).__name__}.{field.name} cannot be sent: {error}'
+            ) from None
     return message
 
 
@@ -154,7 +160,9 @@ def from_message(message: Any) -> Record:
         RecordError: arrays whose lengths disagree; names field, length, expectation and source.
     """
     record_type = RECORD_TYPES[f'{PACKAGE}/msg/{type(message).__name__}']
-    values = {field.name: field.inward(getattr(message, field.name)) for field in _fields(record_type)}
+    values = {
+        field.name: field.inward(getattr(message, field.name)) for field in _fields(record_type)
+    }
     _check_lengths(record_type, values)
     if record_type is Transitions:
         _shape(values)
@@ -163,9 +171,12 @@ def from_message(message: Any) -> Record:
 
 def _refuse(record_type: type, values: dict[str, Any], field: str, expected: str) -> RecordError:
     who = values.get('source') or values.get('node') or values.get('role') or 'its publisher'
-    where = ', '.join(f'{name}={values[name]}' for name in ('sequence', 'phase', 'part') if name in values)
+    where = ', '.join(
+        f'{name}={values[name]}' for name in ('sequence', 'phase', 'part') if name in values
+    )
     return RecordError(
-        f'{record_type.__name__}({where}) from {who!r}: {field} has length {len(values[field])}, expected {expected}; '
+        f'{record_type.__name__}({where}) from {who!r}: {field} has length '
+        f'{len(values[field])}, expected {expected}; '
         f'mend what {who!r} publishes on {TOPICS[record_type]!r}'
     )
 
@@ -188,6 +199,10 @@ def _shape(values: dict[str, Any]) -> None:
     for name, rows in (('observations', steps + 1), ('actions', steps)):
         length = len(values[name])
         if steps < 1 or length < rows or length % rows:
-            expected = f'a multiple of {rows} for steps={steps}' if steps else 'steps of at least 1, not 0'
+            expected = (
+                f'a multiple of {rows} for steps={steps}'
+                if steps
+                else 'steps of at least 1, not 0'
+            )
             raise _refuse(Transitions, values, name, expected)
         values[name] = values[name].reshape(rows, length // rows)

@@ -1,11 +1,12 @@
-"""The one main loop of all nodes: join the run, wait for everybody, then receive, work and publish in slices.
+"""The one main loop of all nodes: join the run, wait for everybody, then receive, work and publish
+in slices.
 
     drain what arrived -> core.receive -> one slice of core.work -> publish -> again
 
-Nothing is learnt in a callback and no thread spins beside the learner. A node answers (signals, parameters, its
-presence) between two slices, so within the length of one: `sac.burst` updates in the learner, one gradient step or
-`codetr.label_batch` segments in the reward node, one chunk in a simulator, one episode in the evaluator. While it waits
-it answers within 50 ms.
+Nothing is learnt in a callback and no thread spins beside the learner. A node answers (signals,
+parameters, its presence) between two slices, so within the length of one: `sac.burst` updates in
+the learner, one gradient step or `codetr.label_batch` segments in the reward node, one chunk in a
+simulator, one episode in the evaluator. While it waits it answers within 50 ms.
 """
 
 import hashlib
@@ -39,14 +40,15 @@ from codetr_ros.records import (
 from codetr_ros.ros import link, messages, parameters, signals
 from codetr_ros.ros.fetch import Fetcher
 from codetr_ros.ros.link import Link
-from codetr_ros.ros.peers import READERS, WRITERS, Ledger, Peer, Peers, needed, published_by
+from codetr_ros.ros.peers import READERS, WRITERS, Ledger, Peers, needed, published_by
 from codetr_ros.ros.signals import Stop
 
 if TYPE_CHECKING:
     from codetr_ros.in_process import Core
 
 MakeCore = Callable[[RunSpec, Settings, str, Path | None], 'Core']
-"""Makes the core of a node: (run, settings, name within the run, folder of checkpoints or None)."""
+"""Makes the core of a node: (run, settings, name within the run, folder of checkpoints or
+None)."""
 
 IDLE = 0.05  # [s] blocked in the executor while there is nothing to do: the longest a signal waits
 TELL_EVERY = 1.0  # [s] between two words of presence and diagnostics
@@ -61,7 +63,8 @@ CANNOT_FINISH_BEFORE: dict[str, tuple[str, ...]] = {
     'learner': ('reward', 'record'),
     'record': ('sim', 'learner'),
 }
-"""Roles that have finished only if they were stopped, as long as a node of this role still waits for something."""
+"""Roles that have finished only if they were stopped, as long as a node of this role still waits
+for something."""
 
 
 class NodeError(RuntimeError):
@@ -104,16 +107,24 @@ class CoreNode:
     # ---- the life of a node
 
     def run(self) -> int:
-        """Everything, from the parameters to the last word; returns the exit code of the process."""
+        """Everything, from the parameters to the last word; returns the exit code of the
+        process.
+        """
         error: str | None = None
         crashed = False
         try:
             if self._join() and self._gather():
                 self._work()
-        except (NodeError, parameters.ParameterError, SettingsError, BagError, run_folder.RunFolderError) as problem:
+        except (
+            NodeError,
+            parameters.ParameterError,
+            SettingsError,
+            BagError,
+            run_folder.RunFolderError,
+        ) as problem:
             error = str(problem)
             self.log.fatal(error)
-        except Exception as problem:
+        except Exception as problem:  # noqa: BLE001 - the report and the last word must go out
             crashed = True
             error = f'{type(problem).__name__}: {problem}'
             self.log.fatal(traceback.format_exc())
@@ -129,17 +140,21 @@ class CoreNode:
         self.link.subscribe(RunSpec, self._take)
         if self.role == 'learner':
             self.settings = parameters.own_settings(self.link.node, self.values['config'])
-            run_id = self.values['run_id'] or f'{time.strftime("%Y%m%d-%H%M%S")}-{secrets.token_hex(2)}'
-            self.run_spec = RunSpec(
-                run_id, PROTOCOL_VERSION, self.settings.seed, self.settings.canonical(), self.settings.hash()
+            run_id = (
+                self.values['run_id'] or f'{time.strftime("%Y%m%d-%H%M%S")}-{secrets.token_hex(2)}'
             )
+            self.run_spec = self.settings.run_spec(run_id)
         self._tell()
         wanted = f'run {self.values["run_id"]!r}' if self.values['run_id'] else 'a run'
         topic = self.link.node.resolve_topic_name('run')
         remedy = 'start `ros2 run learner_node learner` in this namespace'
 
         def lacks() -> list[str]:
-            return [] if self.run_spec else [f'the learner, which announces {wanted} on {topic!r} ({remedy})']
+            return (
+                []
+                if self.run_spec
+                else [f'the learner, which announces {wanted} on {topic!r} ({remedy})']
+            )
 
         if not self._wait_for(lacks):
             return False
@@ -156,12 +171,18 @@ class CoreNode:
                 for info in node.get_publishers_info_by_topic(node.resolve_topic_name('run'))
             ]
             owner = f'learner {" or ".join(owners) or "of the run"}'
-            self.settings = from_canonical(self.run_spec.settings, f'run {self.run_spec.run_id!r} of {owner}')
+            self.settings = from_canonical(
+                self.run_spec.settings, f'run {self.run_spec.run_id!r} of {owner}'
+            )
             parameters.check_against_run(node, self.settings, owner)
         parameters.declare_settings(node, self.settings)
         if 'torch' in sys.modules:  # the recorder has no torch and needs none
             sys.modules['torch'].set_num_threads(self.settings.threads)
-        if self.role == 'learner' and self.folder and not (self.folder / run_folder.CONFIG).exists():
+        if (
+            self.role == 'learner'
+            and self.folder
+            and not (self.folder / run_folder.CONFIG).exists()
+        ):
             self.folder.mkdir(parents=True, exist_ok=True)
             run_folder.write_settings(self.folder, self.settings)
         checkpoints = self.folder / run_folder.CHECKPOINTS if self.folder else None
@@ -172,7 +193,9 @@ class CoreNode:
             self._fetcher = Fetcher(self.link, self.run_spec.run_id, self._receive)
         if self.role == 'learner':
             self.link.publish(self.run_spec)
-        self.log.info(f'run {self.run_spec.run_id}: task {self.settings.task}, method {self.settings.method}')
+        self.log.info(
+            f'run {self.run_spec.run_id}: task {self.settings.task}, method {self.settings.method}'
+        )
         self._tell()
 
     def open_topics(self, settings: Settings) -> None:
@@ -190,14 +213,15 @@ class CoreNode:
         return True
 
     def _lacking(self) -> list[str]:
-        assert self.settings is not None and self.run_spec is not None
+        assert self.settings is not None
+        assert self.run_spec is not None
         absent = self.peers.absent(self.settings, self.run_spec.settings_hash)
         if absent:
             return absent
         reads = [topic for topic, roles in READERS.items() if self.role in roles]
-        return self.link.unmatched(published_by(self.role), self._names(READERS), readers=True) + self.link.unmatched(
-            reads, self._names(WRITERS), readers=False
-        )
+        return self.link.unmatched(
+            published_by(self.role), self._names(READERS), readers=True
+        ) + self.link.unmatched(reads, self._names(WRITERS), readers=False)
 
     def _names(self, table: dict[str, tuple[str, ...]]) -> Callable[[str], set[str]]:
         assert self.settings is not None
@@ -312,18 +336,23 @@ class CoreNode:
             return
         if spec.protocol_version != PROTOCOL_VERSION:
             raise RecordError(
-                f'{describe(spec)}: run {spec.run_id!r} speaks protocol_version {spec.protocol_version}, '
-                f'{self.link.full_name} speaks {PROTOCOL_VERSION}: install the same version of codetr_ros everywhere'
+                f'{describe(spec)}: run {spec.run_id!r} speaks protocol_version '
+                f'{spec.protocol_version}, '
+                f'{self.link.full_name} speaks {PROTOCOL_VERSION}: install the same version of '
+                f'codetr_ros everywhere'
             )
         if hashlib.sha256(spec.settings.encode()).hexdigest() != spec.settings_hash:
             raise RecordError(
-                f'run {spec.run_id!r}: settings_hash {spec.settings_hash!r} is not that of its settings: '
+                f'run {spec.run_id!r}: settings_hash {spec.settings_hash!r} is not that of its '
+                f'settings: '
                 f'install the same version of codetr_ros everywhere'
             )
         if own is not None:
             problem = (
-                f'a second run in the namespace of {self.link.full_name}: {spec.run_id!r} beside {own.run_id!r}. '
-                f'Stop one of them, or give each run a namespace of its own (--ros-args -r __ns:=/other)'
+                f'a second run in the namespace of {self.link.full_name}: {spec.run_id!r} '
+                f'beside {own.run_id!r}. '
+                f'Stop one of them, or give each run a namespace of its own (--ros-args -r '
+                f'__ns:=/other)'
             )
             if self.role == 'learner' and not self._begun:
                 raise NodeError(problem)
@@ -331,7 +360,8 @@ class CoreNode:
         if self.values['run_id'] not in ('', spec.run_id):
             raise RecordError(
                 f'run {spec.run_id!r} is not the one that {self.link.full_name} was started for '
-                f'(parameter run_id = {self.values["run_id"]!r}): leave run_id out, or start that learner'
+                f'(parameter run_id = {self.values["run_id"]!r}): leave run_id out, or start '
+                f'that learner'
             )
         self.received['run'] += 1
         self.run_spec = spec
@@ -341,11 +371,14 @@ class CoreNode:
             return
         own = self.run_spec.run_id if self.run_spec else ''
         if own and said.run_id not in ('', own):
-            self._say_once(f'{said.role} {said.node} is part of another run, {said.run_id!r}; this is {own!r}')
+            self._say_once(
+                f'{said.role} {said.node} is part of another run, {said.run_id!r}; this is {own!r}'
+            )
             return
         if said.node == self.link.full_name and not said.finished:
             problem = (
-                f'two nodes are called {said.node}: start one of them with another name (--ros-args -r __node:=other)'
+                f'two nodes are called {said.node}: start one of them with another name '
+                '(--ros-args -r __node:=other)'
             )
             if not self._begun:
                 raise NodeError(problem)
@@ -395,10 +428,13 @@ class CoreNode:
             'refused': dict(self.refused),
         }
         wrong = bool(lost or self.refused)
-        self.link.diagnose(link.WARN if wrong else link.OK, 'has finished' if finished else self._doing, counters)
+        self.link.diagnose(
+            link.WARN if wrong else link.OK, 'has finished' if finished else self._doing, counters
+        )
 
     def _check_peers(self, now: float, waiting: float) -> None:
-        """While we wait: name peers that fell silent, and give up on those that will not speak again.
+        """While we wait: name peers that fell silent, and give up on those that will not speak
+        again.
 
         Raises:
             NodeError: a peer that we wait for is gone.
@@ -412,8 +448,10 @@ class CoreNode:
             who = f'{peer.said.role} {peer.said.node}'
             if deadline and silent > deadline and waiting > deadline:
                 raise NodeError(
-                    f'{self.link.full_name} gave up: it {self._doing}, and {who} has been silent for {silent:.0f} s '
-                    f'(parameter peer_deadline = {deadline:g}). Look at its log, and start the run again'
+                    f'{self.link.full_name} gave up: it {self._doing}, and {who} has been '
+                    f'silent for {silent:.0f} s '
+                    f'(parameter peer_deadline = {deadline:g}). Look at its log, and start the '
+                    f'run again'
                 )
             if now - self._said.get(who, 0.0) > NAME_EVERY:
                 self._said[who] = now
@@ -425,7 +463,8 @@ class CoreNode:
             if gone and waiting > patience and all(now - peer.heard > GRACE for peer in gone):
                 names = ', '.join(peer.said.node for peer in gone)
                 raise NodeError(
-                    f'{self.link.full_name} gave up: it {self._doing}, but {role} {names} stopped before the run was '
+                    f'{self.link.full_name} gave up: it {self._doing}, but {role} {names} '
+                    f'stopped before the run was '
                     f'over. Look at its log, and start the run again'
                 )
 
@@ -441,13 +480,17 @@ class CoreNode:
     def _end(self, error: str | None, crashed: bool) -> int:
         """Save, report, say goodbye; returns the exit code."""
         finished = bool(self.core and self.core.finished and error is None)
-        steps: list[Callable[[], None]] = [self.closing, lambda: self._report(finished, error), self._goodbye]
+        steps: list[Callable[[], None]] = [
+            self.closing,
+            lambda: self._report(finished, error),
+            self._goodbye,
+        ]
         if self.core is not None and not crashed:  # after a crash its state is not fit to be saved
             steps.insert(0, self.core.close)
         for step in steps:
             try:
                 step()
-            except Exception as problem:
+            except Exception as problem:  # noqa: BLE001 - one failure must not stop the rest
                 error = error or f'{type(problem).__name__}: {problem}'
                 self.log.fatal(f'at the end: {traceback.format_exc()}')
         if self.stop.signal and not error and not finished:
@@ -474,7 +517,11 @@ class CoreNode:
         }
         for said in (self.core.report() if self.core else {}, self.own_report()):
             for key, value in said.items():
-                both = isinstance(value, dict) and isinstance(report.get(key), dict) and key != 'counters'
+                both = (
+                    isinstance(value, dict)
+                    and isinstance(report.get(key), dict)
+                    and key != 'counters'
+                )
                 report[key] = dict(Counter(report[key]) + Counter(value)) if both else value
         run_folder.write_report(self.folder, self.role, self.link.name, report)
 

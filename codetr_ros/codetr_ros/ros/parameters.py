@@ -1,8 +1,9 @@
-"""Every setting of the run as a ROS parameter, with description and range, from the one configuration.
+"""Every setting of the run as a ROS parameter, with description and range, from the one
+configuration.
 
-The learner makes the run's settings from its parameters. All other nodes take them from the run, refuse a
-parameter that contradicts it, and then show the run's settings as read-only parameters, so that
-`ros2 param list|describe|get` answers alike at every node.
+The learner makes the run's settings from its parameters. All other nodes take them from the run,
+refuse a parameter that contradicts it, and then show the run's settings as read-only parameters,
+so that `ros2 param list|describe|get` answers alike at every node.
 """
 
 import types
@@ -25,7 +26,9 @@ NOT_GIVEN = 0.0
 
 
 class ParameterError(ValueError):
-    """A parameter that is unknown, out of range or in contradiction to the run: names it, its value and the remedy."""
+    """A parameter that is unknown, out of range or in contradiction to the run: names it, its
+    value and the remedy.
+    """
 
 
 @dataclass(frozen=True)
@@ -52,17 +55,26 @@ class Own:
 
 
 OWN: dict[str, Own] = {
-    'run_id': Own('', 'id of the run; of the learner: the one it gives (empty: made from the date), of all others: '
+    'run_id': Own('', 'id of the run; of the learner: the one it gives (empty: made from the '
+    'date), of all others: '
                   'the only one they join (empty: any)'),
-    'folder': Own('', 'folder of the run, for checkpoints, bag and the report of the node; empty: nothing is written'),
-    'peer_deadline': Own(60.0, 'seconds that the node waits for peers that are missing or silent; 0: for ever'),
+    'folder': Own('', 'folder of the run, for checkpoints, bag and the report of the node; '
+    'empty: nothing is written'),
+    'peer_deadline': Own(60.0, 'seconds that the node waits for peers that are missing or '
+    'silent; 0: for ever'),
 }  # fmt: skip
 OWN_OF_ROLE: dict[str, dict[str, Own]] = {
     'learner': {
-        'config': Own('quick', 'settings to start from: a preset (quick, cpu, paper) or a YAML file'),
+        'config': Own(
+            'quick', 'settings to start from: a preset (quick, cpu, paper) or a YAML file'
+        ),
     },
     'record': {
-        'bag': Own('', 'folder of the bag; empty: `bag` in `folder`, or where that is empty too no bag at all'),
+        'bag': Own(
+            '',
+            'folder of the bag; empty: `bag` in `folder`, or where that is empty too no bag at '
+            'all',
+        ),
     },
 }
 
@@ -134,7 +146,9 @@ def descriptor(name: str) -> ParameterDescriptor:
     elif kind is float:
         shown.type = Type.DOUBLE.value
         if low is not None and high is not None:
-            shown.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
+            shown.floating_point_range = [
+                FloatingPointRange(from_value=float(low), to_value=float(high))
+            ]
     else:
         shown.type = Type.STRING.value
     if optional:
@@ -159,7 +173,8 @@ def _inward(name: str, value: Any) -> Any:
 def overrides(node: Node) -> dict[str, Any]:
     """What the user gave on the command line or in a parameter file, for any parameter."""
     # rclpy offers no public way to see overrides before they are declared
-    return {name: parameter.value for name, parameter in node._parameter_overrides.items()}
+    given = node._parameter_overrides  # noqa: SLF001
+    return {name: parameter.value for name, parameter in given.items()}
 
 
 def check_names(node: Node, role: str) -> None:
@@ -172,12 +187,15 @@ def check_names(node: Node, role: str) -> None:
     unknown = {
         name: value
         for name, value in overrides(node).items()
-        if name not in known and not node.has_parameter(name) and not name.startswith('qos_overrides.')
+        if name not in known
+        and not node.has_parameter(name)
+        and not name.startswith('qos_overrides.')
     }
     if unknown:
         given = ', '.join(f'{name}={value!r}' for name, value in sorted(unknown.items()))
         raise ParameterError(
-            f'{node.get_fully_qualified_name()} has no parameter {given}. There are: {", ".join(sorted(known))}'
+            f'{node.get_fully_qualified_name()} has no parameter {given}. There are: '
+            f'{", ".join(sorted(known))}'
         )
 
 
@@ -193,9 +211,14 @@ def declare_own(node: Node, role: str) -> dict[str, Any]:
         value = given.get(name, own.default)
         if isinstance(own.default, str):
             value = str(value)  # a run id of digits only arrives as a number
-        elif isinstance(value, bool) or not isinstance(value, (int, float)) or not own.low <= value <= own.high:
+        elif (
+            isinstance(value, bool)
+            or not isinstance(value, (int, float))
+            or not own.low <= value <= own.high
+        ):
             raise ParameterError(
-                f'{node.get_fully_qualified_name()}: parameter {name} = {value!r} must be a number from '
+                f'{node.get_fully_qualified_name()}: parameter {name} = {value!r} must be a '
+                f'number from '
                 f'{own.low:g} to {own.high:g} ({own.description})'
             )
         else:
@@ -210,17 +233,23 @@ def declare_settings(node: Node, settings: Settings) -> None:
     for name, value in settings.flat().items():
         shown = descriptor(name)
         node.declare_parameter(
-            name, Parameter(name, Type(shown.type), _outward(value)).value, shown, ignore_override=True
+            name,
+            Parameter(name, Type(shown.type), _outward(value)).value,
+            shown,
+            ignore_override=True,
         )
 
 
 def own_settings(node: Node, config: str) -> Settings:
-    """The settings that a learner's parameters ask for: its `config`, changed by what was given one by one.
+    """The settings that a learner's parameters ask for: its `config`, changed by what was given
+    one by one.
 
     Raises:
         ParameterError: a setting is refused; names it, its value and what is allowed.
     """
-    given = {name: _inward(name, value) for name, value in overrides(node).items() if name in FIELDS}
+    given = {
+        name: _inward(name, value) for name, value in overrides(node).items() if name in FIELDS
+    }
     try:
         return load(config).changed(given, f'{node.get_fully_qualified_name()}: parameter')
     except SettingsError as error:
@@ -238,19 +267,25 @@ def check_against_run(node: Node, settings: Settings, owner: str) -> None:
     Raises:
         ParameterError: names every such parameter, both values and both nodes.
     """
-    given: Mapping[str, Any] = {name: value for name, value in overrides(node).items() if name in FIELDS}
+    given: Mapping[str, Any] = {
+        name: value for name, value in overrides(node).items() if name in FIELDS
+    }
     name_of_node = node.get_fully_qualified_name()
     run = settings.flat()
     wrong = []
     for name, value in given.items():
         try:
-            same = settings.changed({name: _inward(name, value)}, f'{name_of_node}: parameter') == settings
+            same = (
+                settings.changed({name: _inward(name, value)}, f'{name_of_node}: parameter')
+                == settings
+            )
         except SettingsError as error:
             raise ParameterError(str(error)) from None
         if not same:
             wrong.append(f'{name} = {value!r}, but {owner} has {name} = {run[name]!r}')
     if wrong:
         raise ParameterError(
-            f'{name_of_node}: parameters contradict the run: {"; ".join(wrong)}. Leave them out (the node takes '
+            f'{name_of_node}: parameters contradict the run: {"; ".join(wrong)}. Leave them out '
+            f'(the node takes '
             f'them from the run) or start {owner} with them'
         )

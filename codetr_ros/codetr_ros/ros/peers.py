@@ -1,8 +1,10 @@
-"""Who takes part in a run: which roles it needs, who has said `Presence`, who is missing or silent.
+"""Who takes part in a run: which roles it needs, who has said `Presence`, who is missing or
+silent.
 
-A node begins only when every peer that its topics need is there and matched, by name: a count of subscriptions
-cannot tell a recorder from `ros2 topic echo`. From then on nothing is lost (reliable, deep enough queues), and
-what peers say they have published tells a node what never reached it.
+A node begins only when every peer that its topics need is there and matched, by name: a count of
+subscriptions cannot tell a recorder from `ros2 topic echo`. From then on nothing is lost
+(reliable, deep enough queues), and what peers say they have published tells a node what never
+reached it.
 """
 
 from collections import Counter, deque
@@ -74,7 +76,9 @@ class Peer:
 
 @dataclass
 class Peers:
-    """The other nodes of the run, by instance (a process that was started again is another one)."""
+    """The other nodes of the run, by instance (a process that was started again is another
+    one).
+    """
 
     role: str
     by_instance: dict[str, Peer] = field(default_factory=dict)
@@ -101,7 +105,9 @@ class Peers:
         return list(newest.values())
 
     def absent(self, settings: Settings, settings_hash: str) -> list[str]:
-        """Roles of which too few nodes with the run's settings are there, with what would start them."""
+        """Roles of which too few nodes with the run's settings are there, with what would start
+        them.
+        """
         missing = []
         for role, count in needed(settings).items():
             have = len([p for p in self.alive(role) if p.said.settings_hash == settings_hash])
@@ -127,8 +133,8 @@ class Peers:
 class Ledger:
     """Says what was published but never arrived.
 
-    A `Presence` may overtake the messages it counts, so a record counts as lost only when it has not come
-    `patience` seconds after its publisher said that it was published.
+    A `Presence` may overtake the messages it counts, so a record counts as lost only when it has
+    not come `patience` seconds after its publisher said that it was published.
     """
 
     def __init__(self, patience: float = 5.0) -> None:
@@ -145,4 +151,8 @@ class Ledger:
         """Records missing by topic; only topics of which some are."""
         while self._told and self._told[0][0] <= now - self._patience:
             self._due = self._told.popleft()[1]
-        return {topic: n - received[topic] for topic, n in sorted(self._due.items()) if n > received[topic]}
+        return {
+            topic: n - received[topic]
+            for topic, n in sorted(self._due.items())
+            if n > received[topic]
+        }

@@ -1,21 +1,25 @@
 """Quality of service, named once per topic.
 
-Reliable everywhere. What a late joiner must still hear (`run`, `task`, `policy`, `commits`) is transient local. Every
-queue is deeper than what the permitted phases can put on its topic: KEEP_LAST would drop the rest silently, and
-KEEP_ALL blocks the publisher. `max(FLOOR, MARGIN * most)` is the depth, where `most` is, for P = lag + 1 phases
-(one more than is ever permitted and not yet committed) of N = phase_steps steps, all simulators together:
+Reliable everywhere. What a late joiner must still hear (`run`, `task`, `policy`, `commits`) is
+transient local. Every queue is deeper than what the permitted phases can put on its topic:
+KEEP_LAST would drop the rest silently, and KEEP_ALL blocks the publisher. `max(FLOOR, MARGIN *
+most)` is the depth, where `most` is, for P = lag + 1 phases (one more than is ever permitted and
+not yet committed) of N = phase_steps steps, all simulators together:
 
     transitions, true_rewards   P * N                      a chunk has at least one step
     composite_rewards           P * N                      a segment has at least one step
     episodes                    P * N + evaluate_episodes  an episode has at least one step
     step_rewards                P * (simulators + ceil(16 * memory_steps / 100 kB))
-                                                           at most 4 bytes for each label and 12 for its segment,
-                                                           in parts of more than half of 200 kB
+                                                           at most 4 bytes for each label and 12
+                                                           for its segment, in parts of more than
+                                                           half of 200 kB
     metrics                     P * (4 + simulators) * 4   a few from each node and phase
-    policy                      P + ceil(4000 / N)         and those that come while an evaluation episode runs
+    policy                      P + ceil(4000 / N)         and those that come while an evaluation
+    episode runs
     commits, task               P; simulators
 
-A depth costs nothing by itself: the middleware keeps what has been published, not room for what might be.
+A depth costs nothing by itself: the middleware keeps what has been published, not room for what
+might be.
 """
 
 from collections.abc import Callable
@@ -70,7 +74,8 @@ def depth(topic: str, settings: Settings | None = None) -> int:
 
     Args:
         topic: relative name, one of `records.TOPICS`.
-        settings: of the run; not needed for `run` and `presence`, which come before the settings are known.
+        settings: of the run; not needed for `run` and `presence`, which come before the settings
+            are known.
     """
     return max(FLOOR, ceil(MARGIN * QUALITIES[topic].most(settings or Settings())))
 

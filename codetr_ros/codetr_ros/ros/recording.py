@@ -1,12 +1,13 @@
 """The recorder's wiring: writes what arrives as it came, and commits phases.
 
-Everything is appended to the bag as received bytes before the core sees it, and the bag is flushed and synced before
-a commit goes out: nobody learns from what could be lost. Without a bag the last phases are kept in memory only. In
-both cases the service `fetch_phase` sends one of the last committed phases again.
+Everything is appended to the bag as received bytes before the core sees it, and the bag is flushed
+and synced before a commit goes out: nobody learns from what could be lost. Without a bag the last
+phases are kept in memory only. In both cases the service `fetch_phase` sends one of the last
+committed phases again.
 """
 
 import time
-from collections import Counter, deque
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -42,8 +43,8 @@ NOT_RECORDED = (Presence,)
 class FirstLabels:
     """What of the step rewards goes into the bag when it keeps first labels only.
 
-    Every part is kept, so that the bag has as many as were published; a part holds the segments labelled for the first
-    time, or all of them where the phase's policy is evaluated.
+    Every part is kept, so that the bag has as many as were published; a part holds the segments
+    labelled for the first time, or all of them where the phase's policy is evaluated.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -54,7 +55,9 @@ class FirstLabels:
         """The part reduced to what is kept; None if all of it is."""
         keys = [
             (part.source, episode, first)
-            for episode, first in zip(part.episodes.tolist(), part.first_steps.tolist(), strict=True)
+            for episode, first in zip(
+                part.episodes.tolist(), part.first_steps.tolist(), strict=True
+            )
         ]
         fresh = np.array([key not in self._seen for key in keys], bool)
         self._seen.update(keys)
@@ -87,10 +90,18 @@ class LastPhases:
 
     def commit(self, commit: Commit, raw: bytes) -> None:
         """File under the commit's phase what it names; forget the oldest phase."""
-        last = {(Transitions, s): n for s, n in zip(commit.sources, commit.transitions.tolist(), strict=True)}
-        last |= {(CompositeReward, s): n for s, n in zip(commit.scorers, commit.scores.tolist(), strict=True)}
+        last = {
+            (Transitions, s): n
+            for s, n in zip(commit.sources, commit.transitions.tolist(), strict=True)
+        }
+        last |= {
+            (CompositeReward, s): n
+            for s, n in zip(commit.scorers, commit.scores.tolist(), strict=True)
+        }
         named = [key for key in self._open if key[2] <= last.get(key[:2], -1)]
-        self._committed[commit.phase] = [(key[0], self._open.pop(key)) for key in named] + [(Commit, raw)]
+        self._committed[commit.phase] = [(key[0], self._open.pop(key)) for key in named] + [
+            (Commit, raw)
+        ]
         while len(self._committed) > self._phases:
             del self._committed[min(self._committed)]
 
@@ -125,7 +136,11 @@ class RecordNode(CoreNode):
         self._last = LastPhases(settings.lag + 2)
         kinds = [kind for kind in TOPICS if kind not in NOT_RECORDED]
         self._full = {kind: node.resolve_topic_name(TOPICS[kind]) for kind in kinds}
-        folder = Path(self.values['bag']) if self.values['bag'] else self.folder and self.folder / run_folder.BAG
+        folder = (
+            Path(self.values['bag'])
+            if self.values['bag']
+            else self.folder and self.folder / run_folder.BAG
+        )
         if folder:
             self._bag = McapWriter(folder, [self._bag_topic(kind, settings) for kind in kinds])
             self.log.info(f'records to {folder}')
@@ -139,7 +154,9 @@ class RecordNode(CoreNode):
     def _bag_topic(self, kind: type, settings: Settings) -> BagTopic:
         topic = TOPICS[kind]
         durable = qos.QUALITIES[topic].transient_local
-        return BagTopic(self._full[kind], messages.type_name(kind), qos.depth(topic, settings), durable)
+        return BagTopic(
+            self._full[kind], messages.type_name(kind), qos.depth(topic, settings), durable
+        )
 
     def _take(self, record_type: type, message: Any) -> None:
         joined = self.run_spec is not None
@@ -157,11 +174,15 @@ class RecordNode(CoreNode):
             self._write(kind, raw, published)  # the bag tells what came, sound or not
             self.refuse(kind, error)
             return
-        kept = self._first.keep(record) if self._first and isinstance(record, StepRewards) else None
+        kept = (
+            self._first.keep(record) if self._first and isinstance(record, StepRewards) else None
+        )
         if kept is None:
             self._write(kind, raw, published)
         else:
-            self._write(kind, serialize_message(messages.to_message(kept, message.stamp)), published)
+            self._write(
+                kind, serialize_message(messages.to_message(kept, message.stamp)), published
+            )
         if self.core is not None and kind in self.core.subscribes:
             self._last.hold(record, raw)
             self._receive(record)
@@ -185,17 +206,23 @@ class RecordNode(CoreNode):
         self._last.commit(record, raw)
         self._write(Commit, raw)
 
-    def _send_again(self, request: FetchPhase.Request, response: FetchPhase.Response) -> FetchPhase.Response:
+    def _send_again(
+        self, request: FetchPhase.Request, response: FetchPhase.Response
+    ) -> FetchPhase.Response:
         own = self.run_spec.run_id if self.run_spec else ''
         if request.run_id != own:
-            response.reason = f'this recorder is of run {own!r}, not {request.run_id!r}: ask that of your run'
+            response.reason = (
+                f'this recorder is of run {own!r}, not {request.run_id!r}: ask that of your run'
+            )
             return response
         try:
             found = self._last.get(request.phase)
         except KeyError as error:
             response.reason = str(error.args[0])
             return response
-        self.log.warning(f'{request.requester} lacks something of phase {request.phase}: sending it again')
+        self.log.warning(
+            f'{request.requester} lacks something of phase {request.phase}: sending it again'
+        )
         response.found = True
         response.types = [messages.type_name(kind) for kind, _ in found]
         response.lengths = [len(raw) for _, raw in found]
@@ -206,16 +233,25 @@ class RecordNode(CoreNode):
         told = self.peers.told()
         told.update({t: n for t, n in self.link.published.items() if t in published_by(self.role)})
         arrived = self.received + Counter({TOPICS[Commit]: self._recorded[TOPICS[Commit]]})
-        return {topic: n - arrived[topic] for topic, n in sorted(told.items()) if n > arrived[topic]}
+        return {
+            topic: n - arrived[topic] for topic, n in sorted(told.items()) if n > arrived[topic]
+        }
 
     def settled(self, seconds: float) -> bool:
         """Whether everybody has finished and all that they published is in the bag."""
-        running = [f'{p.said.role} {p.said.node}' for p in self.peers.by_instance.values() if not p.said.finished]
+        running = [
+            f'{p.said.role} {p.said.node}'
+            for p in self.peers.by_instance.values()
+            if not p.said.finished
+        ]
         self._missed = self._still_missing()
         if not running and not self._missed:
             return True
         lacking = [f'{n} of {topic}' for topic, n in self._missed.items()]
-        self._doing = f'waits for the end of {", ".join(running) or "nobody"} and for {", ".join(lacking) or "nothing"}'
+        self._doing = (
+            f'waits for the end of {", ".join(running) or "nobody"} '
+            f'and for {", ".join(lacking) or "nothing"}'
+        )
         deadline = self.values['peer_deadline']
         # somebody who still speaks may work as long as it takes
         heard = max((p.heard for p in self.peers.by_instance.values()), default=0.0)
@@ -226,7 +262,9 @@ class RecordNode(CoreNode):
         return False
 
     def lost(self) -> dict[str, int]:
-        """Records that were published and never came, by topic: for certain at the end, before as others see it."""
+        """Records that were published and never came, by topic: for certain at the end, before as
+        others see it.
+        """
         return self._missed if self.core and self.core.finished else super().lost()
 
     def closing(self) -> None:

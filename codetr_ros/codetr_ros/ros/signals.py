@@ -1,8 +1,9 @@
 """Stop on SIGINT and SIGTERM without a traceback, whatever the process is doing.
 
-rclpy's own handlers shut the context down from a thread, which races with everything that still publishes
-(a double `shutdown`, publishing on an invalid context, a KeyboardInterrupt in the middle of a record). Here a
-signal sets a flag, which the main loop looks at; a second signal changes nothing.
+rclpy's own handlers shut the context down from a thread, which races with everything that still
+publishes (a double `shutdown`, publishing on an invalid context, a KeyboardInterrupt in the middle
+of a record). Here a signal sets a flag, which the main loop looks at; a second signal changes
+nothing.
 """
 
 import signal
@@ -32,6 +33,8 @@ class Stop:
 
 
 def ignore() -> None:
-    """Ignore both from now on: last of all, since an interpreter that ends restores the deadly defaults."""
+    """Ignore both from now on: last of all, since an interpreter that ends restores the deadly
+    defaults.
+    """
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)

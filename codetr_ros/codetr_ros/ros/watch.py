@@ -1,4 +1,6 @@
-"""Sees a run from outside: presence, task, episodes, metrics and commits of a namespace, for progress and summary."""
+"""Sees a run from outside: presence, task, episodes, metrics and commits of a namespace, for
+progress and summary.
+"""
 
 from collections.abc import Callable
 from types import TracebackType
@@ -42,7 +44,9 @@ class Watcher:
         name: node name.
     """
 
-    def __init__(self, on_record: Callable[[Record], None], namespace: str, name: str = 'watch') -> None:
+    def __init__(
+        self, on_record: Callable[[Record], None], namespace: str, name: str = 'watch'
+    ) -> None:
         self._on_record = on_record
         self._namespace = namespace
         self._name = name
@@ -53,7 +57,12 @@ class Watcher:
     def __enter__(self) -> 'Watcher':
         self._context = Context()
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        self._node = Node(self._name, context=self._context, namespace=self._namespace, use_global_arguments=False)
+        self._node = Node(
+            self._name,
+            context=self._context,
+            namespace=self._namespace,
+            use_global_arguments=False,
+        )
         self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self._node)
         for kind in WATCHED:
@@ -65,7 +74,9 @@ class Watcher:
                 QoSProfile(
                     depth=DEPTH,
                     reliability=ReliabilityPolicy.RELIABLE,
-                    durability=DurabilityPolicy.TRANSIENT_LOCAL if durable else DurabilityPolicy.VOLATILE,
+                    durability=DurabilityPolicy.TRANSIENT_LOCAL
+                    if durable
+                    else DurabilityPolicy.VOLATILE,
                 ),
             )
         return self
@@ -100,7 +111,10 @@ class Watcher:
         return len(arrived)
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._executor.remove_node(self._node)
         self._node.destroy_node()
