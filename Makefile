@@ -44,5 +44,5 @@ format: setup
 	@$(VENV)/bin/ruff check --fix .
 
 clean:
-	rm -rf $(VENV) .hypothesis .mypy_cache .pytest_cache .ruff_cache MUJOCO_LOG.TXT
+	rm -rf $(VENV) .venv-removed .hypothesis .mypy_cache .pytest_cache .ruff_cache MUJOCO_LOG.TXT
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

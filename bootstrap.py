@@ -153,7 +153,8 @@ class Setup:
             )
         identity = state.get('identity')
         if identity is None and not state and self.python.exists() and self.site.is_dir():
-            return str(self.venv) in (self.venv / 'bin' / 'pip').read_text(errors='replace')
+            pip = self.venv / 'bin' / 'pip'  # comes last, and names the place it was made for
+            return pip.exists() and str(self.venv) in pip.read_text(errors='replace')
         if identity != self.identity() or not self.python.exists():
             say('the environment was made by another Python or in another place: making it anew')
             return False
@@ -166,10 +167,15 @@ class Setup:
         """Stage 1. An environment that is there is replaced."""
         check_venv_module()
         say(f'environment: {self.venv} with Python {sys.version.split()[0]}')
+        removed = (
+            self.root / '.venv-removed'
+        )  # half a removal must not look like half an environment
         if self.venv.is_symlink():
             self.venv.unlink()
         elif self.venv.exists():
-            shutil.rmtree(str(self.venv))
+            shutil.rmtree(str(removed), ignore_errors=True)
+            self.venv.rename(removed)
+        shutil.rmtree(str(removed), ignore_errors=True)
         code, output = self.call('environment', [sys.executable, '-m', 'venv', str(self.venv)])
         if code:
             raise SetupError(f'{sys.executable} -m venv failed:\n{tail(output)}')

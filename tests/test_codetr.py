@@ -1,4 +1,4 @@
-"""The reward transformer: what the method promises about its weights, rewards, training and labels."""
+"""The reward transformer: what the method promises of its weights, rewards, training, labels."""
 
 import math
 from dataclasses import replace
@@ -7,7 +7,8 @@ import builders
 import numpy as np
 import pytest
 import torch
-
+from builders import ACTION as A
+from builders import OBSERVATION as O
 from codetr_ros.composite import composite
 from codetr_ros.config import Settings
 from codetr_ros.records import CompositeReward, Transitions
@@ -17,7 +18,7 @@ from codetr_ros.rewards.transformer import CausalSelfAttention, RewardTransforme
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.trajectories import SegmentBatch, Trajectories
 
-O, A, DELAY = 3, 2, 6
+DELAY = 6
 TOKENS = ('pair', 'merged')
 
 
@@ -38,7 +39,7 @@ def settings(**changes) -> Settings:
 
 
 def memory(lengths=(20, 15), delay=DELAY, kind='sum', seed=0) -> Trajectories:
-    """Episodes of these lengths, all segments scored; true rewards are a function of what is observed and done."""
+    """Episodes of these lengths, all segments scored; a step's reward depends on it alone."""
     rng = np.random.default_rng(seed)
     found = Trajectories(O, A, delay, 10_000, 1000)
     for episode, steps in enumerate(lengths):
@@ -236,10 +237,10 @@ def test_a_paper_sized_network_has_as_many_parameters_as_the_published_code(toke
     assert sum(p.numel() for p in network.parameters()) == 2_789_377
 
 
-# ------------------------------------------------------------------------------- segments and padding
+# ---------------------------------------------------------------------------- segments and padding
 
 
-def test_context_and_other_segments_leave_the_weights_alone_where_attention_is_confined_to_the_segment():
+def test_the_attention_of_a_segment_does_not_see_the_context_unless_its_scope_is_the_window():
     data = memory()
     made = model(data, context='episode', attention_scope='segment', layers=1)
     batch = whole(data, made.context)
@@ -293,7 +294,9 @@ def test_the_scope_decides_whether_the_context_takes_part_in_the_weights(scope):
     np.testing.assert_allclose(weights.sum(1)[~with_context], own[~with_context], rtol=1e-5)
     fits = np.isclose(weights.sum(1)[with_context], own[with_context], rtol=1e-5)
     assert fits.all() if scope == 'segment' else not fits.any()
-    assert not made.label(batch)[np.arange(batch.actions.shape[1]) < batch.context[:, None]].any()
+    before = np.arange(batch.actions.shape[1]) < batch.context[:, None]
+    assert not weights[before].any()
+    assert not made.label(batch)[before].any()
 
 
 @pytest.mark.parametrize(
@@ -318,17 +321,22 @@ def test_padding_changes_nothing_whatever_it_holds(changes):
     np.testing.assert_allclose(made.label(alone)[0], row, rtol=1e-5, atol=1e-6)
 
 
-# ------------------------------------------------------------------------------------------- training
+# ---------------------------------------------------------------------------------------- training
 
 
 @pytest.mark.parametrize('kind', ['sum', 'sum_square', 'square_sum', 'max'])
 def test_sixty_four_segments_of_each_composite_type_are_learnt_by_heart(kind):
     data = memory(lengths=(128,) * 4, delay=8, kind=kind)
     assert len(data.segment_ids()) == 64
-    made = Codetr(
-        settings(delay=8, learning_rate=1e-2, warmup_gradient_steps=20, batch=64, schedule='cosine', total_gradient_steps=200),
-        O, A,
-    )  # fmt: skip
+    config = settings(
+        delay=8,
+        learning_rate=1e-2,
+        warmup_gradient_steps=20,
+        batch=64,
+        schedule='cosine',
+        total_gradient_steps=200,
+    )
+    made = Codetr(config, O, A)
     made.prepare(data)
     for step in range(200):
         made.gradient_step(data, generator(0, step))
@@ -432,7 +440,7 @@ def test_diverged_training_is_refused_and_changes_no_weight():
     assert torch.equal(made.network.causal.action.weight, before)
 
 
-# ------------------------------------------------------------------------------------------- labelling
+# --------------------------------------------------------------------------------------- labelling
 
 
 @pytest.mark.parametrize(

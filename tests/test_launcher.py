@@ -197,12 +197,13 @@ def test_processes_end_when_their_parent_is_killed(tmp_path: Path) -> None:
         stdout=subprocess.PIPE,
         text=True,
     )
-    assert parent.stdout is not None
-    pid = int(parent.stdout.readline())
-    wait_until(lambda: 'ready\n' in (tmp_path / 'sim.log').read_text(), 'the child')
-
-    parent.kill()
-    parent.wait()
+    try:
+        assert parent.stdout is not None
+        pid = int(parent.stdout.readline())
+        wait_until(lambda: 'ready\n' in (tmp_path / 'sim.log').read_text(), 'the child')
+    finally:
+        parent.kill()
+        parent.wait()
     parent.stdout.close()
 
     wait_until((tmp_path / 'order').exists, 'the child to be told of the death of its parent')
@@ -344,16 +345,26 @@ def test_an_interrupt_ends_all_processes_and_is_no_failure(
     assert signal.getsignal(number) == before
 
 
+@pytest.mark.parametrize(
+    ('handler', 'failure'),
+    [('sys.exit(3)', 'sim ended with exit code 3'), (None, None)],
+    ids=['fails', 'had not come so far as to handle signals'],
+)
 def test_a_process_that_ends_badly_after_an_interrupt_is_named(
-    tmp_path: Path, processes: Processes
+    tmp_path: Path, processes: Processes, handler: str | None, failure: str | None
 ) -> None:
-    start(processes, tmp_path, python('sim', READY + WAIT))  # dies of KeyboardInterrupt
+    taken = 'signal.SIG_DFL' if handler is None else f'lambda *_: {handler}'
+    start(
+        processes,
+        tmp_path,
+        python('sim', READY + f'signal.signal(signal.SIGINT, {taken})\n' + WAIT),
+    )
 
     with Interrupts() as interrupts:
         os.kill(os.getpid(), signal.SIGINT)
-        failure = supervise(processes, poll(processes), interrupts, Silence())
+        said = supervise(processes, poll(processes), interrupts, Silence())
 
-    assert failure in ('sim was ended by SIGINT', 'sim ended with exit code 1')
+    assert said == failure
 
 
 def test_code_that_does_not_look_is_interrupted_by_the_second_request() -> None:

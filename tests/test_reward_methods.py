@@ -1,20 +1,22 @@
 """What every reward method promises, whatever it does: one contract that all of them inherit."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import builders
 import numpy as np
 import pytest
 import torch
-
-from codetr_ros import rewards
+from builders import ACTION as A
+from builders import OBSERVATION as O
 from codetr_ros.config import IN_PROCESS_ONLY, Method, Settings
 from codetr_ros.records import F32, CompositeReward, TrueRewards
 from codetr_ros.rewards import RewardMethod, RewardModelError, segment_steps
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.trajectories import SegmentBatch, Trajectories
 
-O, A, DELAY = builders.O, builders.A, 7
+from codetr_ros import rewards
+
+DELAY = 7
 LENGTHS = (24, 14, 3)  # a short last segment, none, and an episode shorter than a segment
 
 
@@ -67,7 +69,7 @@ class Contract:
     """Inherit and set `method`, and `changes` to the settings."""
 
     method: Method
-    changes: dict[str, Any] = {}  # noqa: RUF012
+    changes: ClassVar[dict[str, Any]] = {}
 
     def settings(self, **changes: Any) -> Settings:
         return builders.tiny(**{'method': self.method, 'delay': DELAY} | self.changes | changes)
@@ -234,19 +236,19 @@ class TestCodetr(Contract):
 
 
 class TestCodetrAsInThePaper(TestCodetr):
-    changes = {'codetr__tokens': 'pair', 'codetr__schedule': 'cosine'}  # noqa: RUF012
+    changes: ClassVar[dict[str, Any]] = {'codetr__tokens': 'pair', 'codetr__schedule': 'cosine'}
 
 
 class TestCodetrWithContext(TestCodetr):
-    changes = {
+    changes: ClassVar[dict[str, Any]] = {
         'codetr__context': 'episode',
         'codetr__attention_scope': 'window',
         'codetr__window': 10,
-    }  # noqa: RUF012
+    }
 
 
 class TestCodetrOfRewardsAlone(TestCodetr):
-    changes = {'codetr__label': 'rhat', 'codetr__head_scale': 'one'}  # noqa: RUF012
+    changes: ClassVar[dict[str, Any]] = {'codetr__label': 'rhat', 'codetr__head_scale': 'one'}
 
 
 class Rule(Contract):
@@ -318,7 +320,8 @@ class TestOnes(Rule):
 def test_a_method_that_does_not_exist_is_refused_by_name():
     unchecked = builders.tiny().model_copy(update={'method': 'magic'})
     with pytest.raises(
-        RewardModelError, match="method = 'magic'.*choose one of codetr, none, uniform, true, ones"
+        RewardModelError,
+        match=r"method = 'magic'.*choose one of codetr, none, uniform, true, ones",
     ):
         rewards.make(unchecked, O, A)
 

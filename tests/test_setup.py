@@ -93,6 +93,20 @@ def test_an_interrupted_installation_is_begun_again_from_nothing(root: Path):
     assert not (interrupted.site / 'half').exists()
 
 
+def test_an_environment_whose_making_was_interrupted_is_made_anew(root: Path):
+    setup = Recorded(root)
+    setup.make_environment()
+    (setup.python.parent / 'pip').unlink()
+    assert stages(root) == EVERYTHING
+
+
+def test_an_interrupted_removal_of_an_environment_is_completed(root: Path):
+    (root / '.venv-removed').mkdir()
+    (root / '.venv-removed' / 'half').touch()
+    assert stages(root) == EVERYTHING
+    assert not (root / '.venv-removed').exists()
+
+
 def test_an_installation_that_failed_by_itself_is_taken_up_where_it_was(root: Path):
     with pytest.raises(SetupError, match='it broke'):
         Recorded(root, fail='packages', code=1).run()

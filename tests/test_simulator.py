@@ -186,7 +186,7 @@ def test_a_segment_cut_short_by_termination_still_gets_its_score(falling):
 
 def test_a_terminal_state_reached_at_the_horizon_is_terminated_not_truncated():
     pendulum = gymnasium.spec(FALLS).entry_point
-    falls = tiny(task=FALLS)
+    falls = tiny(task=FALLS, delay=3)
     first = kind(EpisodeResult, simulate(falls, [permit(0)]))[0]
     assert first.terminated
     gymnasium.register('Short-v0', pendulum, max_episode_steps=first.length)

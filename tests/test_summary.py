@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from codetr_ros.config import Settings
 from codetr_ros.progress import Progress, duration
 from codetr_ros.records import Commit, EpisodeResult, Presence, Record, metrics
 from codetr_ros.summary import Summary
 
 from codetr_ros import config, report, run_folder, summary
+from codetr_ros.config import Settings
 
 SETTINGS = config.load('quick').changed(
     {'steps': 2500, 'phase_steps': 1000, 'evaluate_every': 1000, 'evaluate_episodes': 2}
@@ -84,6 +84,7 @@ REPORTS: dict[str, dict[str, Any]] = {
         'role': 'reward',
         'published': {'step_rewards': 3},
         'received': {'transitions': 100, 'composite_rewards': 60},
+        'lost': {'composite_rewards': 5},
         'refused': {'composite_rewards': 4},
         'reward_model_sha256': 'def',
         'gradient_steps': 240,
@@ -167,8 +168,9 @@ def test_messages_are_counted_by_topic_over_all_nodes() -> None:
         'refused': 0,
     }
     assert said['messages']['composite_rewards']['refused'] == 4
+    assert said['messages']['composite_rewards']['lost'] == 5
     assert said['messages']['true_rewards']['published'] == 0, 'a silent topic is there with zeros'
-    assert (said['lost'], said['duplicated'], said['refused']) == (1, 2, 4)
+    assert (said['lost'], said['duplicated'], said['refused']) == (6, 2, 4)
 
 
 def test_what_each_process_took_is_listed_this_one_included() -> None:

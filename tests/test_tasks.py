@@ -172,6 +172,14 @@ def test_actions_are_scaled_to_the_environments_bounds(counting, action, bound):
     assert environment.step(np.array([action], np.float32))[0][1] == bound
 
 
+def test_an_observation_stays_as_it_was_although_the_environment_reuses_its_array(counting):
+    environment = make(counting())
+    environment.reset(seed=0)
+    first, _, _ = environment.step(np.zeros(1, np.float32))
+    environment.step(np.zeros(1, np.float32))
+    assert first[0] == 1
+
+
 def test_an_environment_steps_beyond_its_horizon_without_ending_by_itself(counting):
     environment = make(counting(horizon=3))
     environment.reset(seed=0)

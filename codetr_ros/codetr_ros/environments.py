@@ -223,9 +223,8 @@ class ControlSuiteEnvironment(Environment):
         super().__init__(task, size, box.minimum, box.maximum, float(self._env.control_timestep()))
 
     def _reset(self, seed: int) -> NDArray[Any]:
-        self._env.task.random.seed(
-            seed
-        )  # all that a task of the suite draws comes from this generator
+        # all that a task of the suite draws comes from this generator
+        self._env.task.random.seed(seed)
         observation: NDArray[Any] = self._env.reset().observation['observations']
         return observation
 

@@ -82,7 +82,7 @@ def commands(
     Raises:
         LaunchError: an executable is missing.
     """
-    nodes = [('sim' if i == 1 else f'sim_{i}', 'sim') for i in range(1, settings.simulators + 1)]
+    nodes = [(name, 'sim') for name in settings.sources]
     if settings.evaluate_every > 0:
         nodes.append(('evaluate', 'evaluate'))
     nodes += [('reward', 'reward'), ('record', 'record'), ('learner', 'learner')]
@@ -279,9 +279,7 @@ class Processes:
             )
             if time.monotonic() - began > limit:
                 for node in waiting:
-                    self.say(
-                        f'{node.name} did not end {limit:g} s after SIGINT: killing it'
-                    )
+                    self.say(f'{node.name} did not end {limit:g} s after SIGINT: killing it')
                 self.kill(waiting)
                 return
             time.sleep(_POLL)
@@ -294,6 +292,4 @@ class Processes:
             if self.running():
                 self.stop()
         finally:
-            # Whatever a node itself started is in its group. One that has ended cleanly leaves
-            # none behind.
-            self.kill(self.nodes)
+            self.kill(self.running())

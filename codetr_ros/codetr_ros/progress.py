@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import Any, TextIO
 
 import numpy as np
-from rich.console import Console, Group, RenderableType
+from rich.console import Console, RenderableType
 from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
@@ -189,7 +189,11 @@ class Progress:
         for name, text in self._facts():
             bad = name == 'lost messages' and self.lost > 0
             table.add_row(Text(name, style='dim'), Text(text, style='bold red' if bad else ''))
-        bar = ProgressBar(total=self._settings.steps, completed=self.steps, width=60)
         nodes = ', '.join(sorted(node.rsplit('/', 1)[-1] for node in self._present))
         said = [f'{self._note}...' if self._note else '', f'nodes: {nodes}' if nodes else '']
-        return Group(Text('  '.join(s for s in said if s), style='dim'), bar, table)
+        whole = Table.grid()
+        if any(said):
+            whole.add_row(Text('  '.join(text for text in said if text), style='dim'))
+        whole.add_row(ProgressBar(total=self._settings.steps, completed=self.steps, width=60))
+        whole.add_row(table)
+        return whole

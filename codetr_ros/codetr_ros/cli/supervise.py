@@ -132,7 +132,9 @@ def _stop_all(processes: Processes, reason: str) -> str:
 
 def _after_stop(processes: Processes) -> str | None:
     """An interrupted run has failed only where a node did not end as it should."""
-    odd = [node.how_it_ended() for node in processes.nodes if node.code != 0]
+    # SIGINT itself ends a process that has not yet come so far as to handle it.
+    clean = (0, -signal.SIGINT)
+    odd = [node.how_it_ended() for node in processes.nodes if node.code not in clean]
     return '; '.join(odd) or None
 
 

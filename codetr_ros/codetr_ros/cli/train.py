@@ -130,8 +130,9 @@ def train(settings: Settings, run_id: str, folder: Path, in_process: bool) -> in
     show(built, folder, Console())
     if outcome.failure:
         say_failure(outcome)
-        return FAILED
-    return INTERRUPTED if outcome.interrupted else 0
+    if outcome.interrupted:
+        return INTERRUPTED
+    return FAILED if outcome.failure else 0
 
 
 def _in_process(
@@ -272,7 +273,15 @@ def show(summary: Mapping[str, Any], folder: Path, console: Console) -> None:
 def say_failure(outcome: Outcome) -> None:
     """Say on stderr why the run failed, with the end of the log that explains it."""
     console = Console(stderr=True)
-    console.print(f'\ncodetr: the run failed: {outcome.failure}', style='bold red', markup=False)
+    console.print(
+        f'\ncodetr: the run failed: {outcome.failure}',
+        style='bold red',
+        markup=False,
+        soft_wrap=True,
+    )
     if outcome.log is not None:
-        console.print(f'the end of {_short(outcome.log)}:', markup=False, highlight=False)
-        console.print(launcher.end_of_log(outcome.log), markup=False, highlight=False)
+        console.print(
+            f'the end of {_short(outcome.log)}:', markup=False, highlight=False, soft_wrap=True
+        )
+        text = launcher.end_of_log(outcome.log)
+        console.print(text, markup=False, highlight=False, soft_wrap=True)

@@ -119,7 +119,7 @@ class Codetr:
         return {'reward_loss': said, 'learning_rate': rate}
 
     def components(self, batch: SegmentBatch) -> tuple[F32, F32]:
-        """w and rhat, in units of c, (B, L) each, of the segments' steps; 0 elsewhere."""
+        """Weights w and rewards rhat (in units of c) of the segments' steps, (B, L) each."""
         self._require_prepared()
         self.network.eval()
         with torch.inference_mode():

@@ -32,6 +32,7 @@ class CausalSelfAttention(nn.Module):
         self.out = nn.Linear(d, d)
 
     def forward(self, h: Tensor) -> Tensor:
+        """Tokens (B, N, d) to what they attend to, mixed (B, N, d)."""
         b, n, d = h.shape
         qkv = self.qkv(h).view(b, n, 3, self.heads, d // self.heads)  # (B, N, 3, H, d/H)
         q, k, v = qkv.permute(2, 0, 3, 1, 4)  # each (B, H, N, d/H)
@@ -54,9 +55,10 @@ class Block(nn.Module):
         self.dropout = nn.Dropout(settings.dropout)
 
     def forward(self, h: Tensor) -> Tensor:
+        """Tokens (B, N, d) to tokens of the next layer (B, N, d)."""
         h = h + self.dropout(self.attention(self.norm1(h)))  # (B, N, d)
-        h = h + self.dropout(self.mlp(self.norm2(h)))  # (B, N, d)
-        return h
+        mixed: Tensor = h + self.dropout(self.mlp(self.norm2(h)))  # (B, N, d)
+        return mixed
 
 
 class CausalTransformer(nn.Module):
@@ -81,6 +83,7 @@ class CausalTransformer(nn.Module):
         self.norm_out = nn.LayerNorm(d)
 
     def forward(self, observations: Tensor, actions: Tensor) -> Tensor:
+        """Observations (B, L, O) and actions (B, L, A) to causal states (B, L, d)."""
         s = self.observation(observations)  # (B, L, d)
         a = self.action(actions)  # (B, L, d)
         position = self.position.weight[: s.shape[1]]  # (L, d)
@@ -100,7 +103,7 @@ class SequenceWeights(nn.Module):
         super().__init__()
         d = settings.embedding
         self.qk = nn.Linear(d, 2 * d)
-        self.scale = 1 / math.sqrt(d) if settings.head_scale == 'inverse_sqrt' else 1.0
+        self.scale = {'inverse': 1 / d, 'inverse_sqrt': 1 / math.sqrt(d), 'one': 1.0}[settings.head_scale]
 
     def attention(self, x: Tensor, inside: Tensor) -> Tensor:
         """Softmax attention (B, L, L) among the steps `inside` (B, L); rows of others are 0."""
@@ -111,6 +114,7 @@ class SequenceWeights(nn.Module):
         return found
 
     def forward(self, x: Tensor, inside: Tensor) -> Tensor:
+        """Causal states (B, L, d) to weights (B, L) of the steps that are `inside` (B, L)."""
         return self.attention(x, inside).sum(1)  # (B, L), the column sums
 
 
@@ -118,6 +122,7 @@ class UnitWeights(nn.Module):
     """w_t = 1: the ablation, a plain sum of causal step rewards."""
 
     def forward(self, x: Tensor, inside: Tensor) -> Tensor:
+        """1 for the steps that are `inside` (B, L), 0 for others."""
         return inside.to(x.dtype)  # (B, L)
 
 

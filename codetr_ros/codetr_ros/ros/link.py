@@ -6,7 +6,6 @@ messages are drained until the count of callbacks stands still; blocking in it c
 of a core at 50 ms) and a message wakes it.
 """
 
-import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -163,17 +162,13 @@ class Link:
             ]
         return found
 
-    def wait_acked(self, deadline: float) -> list[str]:
-        """Wait until the readers have everything that was published; returns the topics on which
-        they have not.
-        """
-        end = time.monotonic() + deadline
-        late = []
-        for topic, publisher in self._publishers.items():
-            left = max(0.0, end - time.monotonic())
-            if not publisher.wait_for_all_acked(Duration(seconds=left)):
-                late.append(topic)
-        return late
+    def unacknowledged(self) -> list[str]:
+        """Topics on which some reader has not confirmed yet that it has everything."""
+        return [
+            topic
+            for topic, publisher in self._publishers.items()
+            if not publisher.wait_for_all_acked(Duration())
+        ]
 
     def close(self) -> None:
         """Take the node off the graph."""

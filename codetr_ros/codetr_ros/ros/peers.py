@@ -122,6 +122,10 @@ class Peers:
         roles = {role for topic in topics for role in WRITERS.get(topic, ())}
         return [peer for role in sorted(roles) for peer in self.alive(role)]
 
+    def anybody_left(self) -> bool:
+        """Whether some peer has not finished."""
+        return any(not peer.said.finished for peer in self.by_instance.values())
+
     def told(self) -> 'Counter[str]':
         """Records that all peers say they have published, by topic."""
         total: Counter[str] = Counter()

@@ -1,0 +1,54 @@
+"""The five nodes of a run in one namespace: `ros2 launch codetr_ros train.launch.py config:=quick`.
+
+The nodes start in any order and wait for each other; the launch ends when the recorder has, which is last.
+"""
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, EmitEvent, RegisterEventHandler
+from launch.event_handlers import OnProcessExit
+from launch.events import Shutdown
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+ARGUMENTS = {
+    'namespace': ('codetr', 'namespace of the run; each run needs one of its own'),
+    'config': ('quick', 'settings: a preset (quick, cpu, paper) or a YAML file'),
+    'run_id': ('', 'id of the run; empty: made from the date'),
+    'folder': ('', 'folder for bag, checkpoints and reports; empty: nothing is written'),
+    'peer_deadline': ('60.0', 'seconds that nodes wait for each other'),
+}
+NODES = (
+    ('sim_node', 'sim'),
+    ('sim_node', 'evaluate'),
+    ('reward_node', 'reward'),
+    ('codetr_ros', 'record'),
+    ('learner_node', 'learner'),
+)
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Start the nodes; only the learner is told what to do, the others take it from the run."""
+    value = {name: LaunchConfiguration(name) for name in ARGUMENTS}
+    shared = {name: value[name] for name in ('folder', 'run_id', 'peer_deadline')}
+    nodes = {
+        executable: Node(
+            package=package,
+            executable=executable,
+            name=executable,
+            namespace=value['namespace'],
+            output='screen',
+            parameters=[shared | ({'config': value['config']} if executable == 'learner' else {})],
+        )
+        for package, executable in NODES
+    }
+    declared = [
+        DeclareLaunchArgument(name, default_value=default, description=description)
+        for name, (default, description) in ARGUMENTS.items()
+    ]
+    end = RegisterEventHandler(
+        OnProcessExit(
+            target_action=nodes['record'],
+            on_exit=[EmitEvent(event=Shutdown(reason='the run is over'))],
+        )
+    )
+    return LaunchDescription([*declared, *nodes.values(), end])

@@ -1,0 +1,377 @@
+"""Nodes as processes, among peers that this test plays itself over real topics."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builders import policy, score, task_spec, tiny, transitions
+
+rclpy = pytest.importorskip('rclpy', reason='needs ROS')
+
+from codetr_msgs.srv import FetchPhase
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
+from rosbags.highlevel import AnyReader
+
+from codetr_ros import run_folder
+from codetr_ros.config import load
+from codetr_ros.records import PROTOCOL_VERSION, TOPICS, Commit, Presence, RunSpec, StepRewards
+from codetr_ros.ros import peers
+from codetr_ros.ros.link import Link
+from codetr_ros.ros.watch import Watcher
+
+ROOT = Path(__file__).resolve().parents[2]
+MODULES = {
+    'record': 'codetr_ros.ros.record',
+    'sim': 'sim_node.sim',
+    'learner': 'learner_node.learner',
+}
+NAMESPACE = '/r'
+PATIENCE = 60.0  # discovery and imports on a busy machine
+
+
+@contextmanager
+def process(role: str, *parameters: str, name: str | None = None):
+    """A node of this role in the namespace of the test; killed at the end if it has not ended."""
+    command = [sys.executable, '-m', MODULES[role], '--ros-args', '-r', f'__ns:={NAMESPACE}']
+    command += ['-r', f'__node:={name}'] if name else []
+    for parameter in parameters:
+        command += ['-p', parameter]
+    node = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        yield node
+    finally:
+        if node.poll() is None:
+            node.kill()
+        node.communicate()
+
+
+def output(node: subprocess.Popen) -> str:
+    return node.communicate(timeout=PATIENCE)[0]
+
+
+class Play:
+    """Peers played by the test: they say that they are there and publish what they are told to."""
+
+    def __init__(self, settings, roles=('learner', 'sim', 'reward'), run_id='run'):
+        self.settings = settings
+        self.spec = settings.run_spec(run_id)
+        self.heard = []
+        self.links = {role: Link(role) for role in roles}
+        for role, link in self.links.items():
+            link.advertise(['presence', *peers.published_by(role)], settings)
+            for kind in TOPICS:
+                if role in peers.READERS.get(TOPICS[kind], ()) or kind in (Presence, RunSpec):
+                    link.subscribe(kind, lambda kind, message, role=role: self.heard.append((role, message)), settings)
+        self.finished = False
+        self.claimed = {}
+        if 'learner' in roles:
+            self.links['learner'].publish(self.spec)
+
+    def say(self):
+        for role, link in self.links.items():
+            topics = peers.published_by(role)
+            counts = [link.published[t] + self.claimed.get(t, 0) for t in topics]
+            link.publish(
+                Presence(
+                    self.spec.run_id, role, link.full_name, f'{role} of the test', self.spec.settings_hash,
+                    self.finished, topics, np.array(counts, np.uint64),
+                )
+            )  # fmt: skip
+
+    def until(self, found, patience=PATIENCE):
+        """Spin, saying presence, until `found()` is true; returns what it returns."""
+        end, said = time.monotonic() + patience, 0.0
+        while time.monotonic() < end:
+            if time.monotonic() - said > 0.3:
+                said = time.monotonic()
+                self.say()
+            for link in self.links.values():
+                link.drain(0.01)
+                while link.inbox:
+                    link.inbox.popleft()()
+            if result := found():
+                return result
+        raise AssertionError(f'not within {patience} s; heard {[type(m).__name__ for _, m in self.heard][-20:]}')
+
+    def messages(self, kind, role=None):
+        return [m for r, m in self.heard if type(m).__name__ == kind and role in (None, r)]
+
+    def presence_of(self, role):
+        return [m for m in self.messages('Presence') if m.role == role and 'of the test' not in m.instance_id]
+
+    def close(self):
+        for link in self.links.values():
+            link.close()
+
+
+@pytest.fixture
+def play(ros_domain):
+    made = []
+    rclpy.init(args=['test', '--ros-args', '-r', f'__ns:={NAMESPACE}'], signal_handler_options=SignalHandlerOptions.NO)
+
+    def start(**options):
+        settings = options.pop('settings', tiny(steps=5, phase_steps=5, warmup_steps=5, evaluate_every=0))
+        made.append(Play(settings, **options))
+        return made[-1]
+
+    yield start
+    for one in made:
+        one.close()
+    rclpy.try_shutdown()
+
+
+def one_phase(play):
+    """What a run of one phase of five steps publishes, up to its commit."""
+    sim, learner = play.links['sim'], play.links['learner']
+    sim.publish(task_spec())
+    learner.publish(policy(steps=np.array([5], np.uint32)))
+    sim.publish(transitions(phase_end=True, scores_due=1))
+    sim.publish(score(length=5))
+    return play.until(lambda: play.messages('Commit', 'learner'))[0]
+
+
+def everybody_matched(play):
+    """Whether the recorder reads what the test publishes."""
+    return not play.links['sim'].unmatched(
+        ['transitions', 'composite_rewards', 'task'], lambda _: {f'{NAMESPACE}/record'}, readers=True
+    ) and not play.links['reward'].unmatched(['step_rewards'], lambda _: {f'{NAMESPACE}/record'}, readers=True)
+
+
+def test_a_recorder_commits_a_phase_and_keeps_every_byte_of_it(play, tmp_path):
+    play = play()
+    with process('record', f'folder:={tmp_path}', 'peer_deadline:=30.0') as node:
+        play.until(lambda: everybody_matched(play))
+        commit = one_phase(play)
+        assert (commit.phase, list(commit.sources), list(commit.transitions)) == (0, ['sim'], [0])
+        segment = [np.array([n], np.uint32) for n in (0, 0, 5)]
+        labels = np.arange(5, dtype=np.float32)
+        play.links['reward'].publish(StepRewards('run', 0, 1, 0, 1, 'sim', *segment, labels))
+        play.finished = True
+        play.until(lambda: node.poll() is not None)
+        said = output(node)
+    assert node.returncode == 0, said
+    assert 'Traceback' not in said
+    with AnyReader([tmp_path / 'bag']) as bag:
+        read = {c.topic: bag.deserialize(raw, c.msgtype) for c, _, raw in bag.messages()}
+        counts = {c.topic: c.msgcount for c in bag.connections if c.msgcount}
+    assert read['/r/transitions'].observations.tobytes() == transitions().observations.tobytes()
+    assert read['/r/step_rewards'].labels.tobytes() == labels.tobytes()
+    report = run_folder.read_report(run_folder.report_path(tmp_path, 'record', 'record'))
+    assert report['recorded'] == {topic.removeprefix('/r/'): n for topic, n in counts.items()}
+    assert report['recorded'] == {
+        'run': 1, 'task': 1, 'policy': 1, 'transitions': 1, 'composite_rewards': 1,
+        'step_rewards': 1, 'commits': 1, 'metrics': 1,
+    }  # fmt: skip
+    assert report['lost'] == {}
+    assert report['finished']
+
+
+def test_what_was_published_and_never_came_is_reported_as_lost(play, tmp_path):
+    play = play()
+    with process('record', f'folder:={tmp_path}', 'peer_deadline:=3.0') as node:
+        play.until(lambda: everybody_matched(play))
+        one_phase(play)
+        play.claimed = {'step_rewards': 2}
+        play.finished = True
+        play.say()
+        said = output(node)
+    assert 'gave up after 3 s: waits for the end of nobody and for 2 of step_rewards' in said
+    report = run_folder.read_report(run_folder.report_path(tmp_path, 'record', 'record'))
+    assert report['lost'] == {'step_rewards': 2}
+
+
+def test_a_committed_phase_is_sent_again_and_another_refused_with_the_reason(play):
+    play = play()
+    with process('record') as node:
+        play.until(lambda: everybody_matched(play))
+        one_phase(play)
+        client = play.links['learner'].node.create_client(FetchPhase, 'fetch_phase')
+        play.until(client.service_is_ready)
+
+        def ask(**request):
+            future = client.call_async(FetchPhase.Request(requester='/r/learner', **request))
+            play.until(future.done)
+            return future.result()
+
+        from codetr_ros.ros.fetch import unpack
+
+        records = unpack(ask(run_id='run', phase=0))
+        assert [type(r).__name__ for r in records] == ['Transitions', 'CompositeReward', 'Commit']
+        assert records[0].observations.tobytes() == transitions().observations.tobytes()
+        assert ask(run_id='run', phase=1).reason == 'phase 1 is not in memory; these are: 0'
+        assert "not 'other'" in ask(run_id='other', phase=0).reason
+        node.send_signal(signal.SIGTERM)
+        said = output(node)
+    assert node.returncode == 0, said
+
+
+def test_what_must_be_refused_is_counted_and_changes_nothing(play, tmp_path):
+    play = play()
+    with process('record', f'folder:={tmp_path}') as node:
+        play.until(lambda: everybody_matched(play))
+        play.links['sim'].publish(transitions(run_id='another'))
+        one_phase(play)
+        diagnostics = []
+        play.links['sim'].node.create_subscription(DiagnosticArray, '/diagnostics', diagnostics.append, 10)
+        status = play.until(
+            lambda: [s for a in diagnostics for s in a.status if s.name == '/r/record: messages']
+        )[0]
+        assert status.level == b'\x01'
+        assert {v.key: v.value for v in status.values}['refused transitions'] == '1'
+        play.finished = True
+        play.until(lambda: node.poll() is not None)
+        said = output(node)
+    assert "of run 'another', this is run 'run'" in said
+    assert node.returncode == 0
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM], ids=lambda s: s.name)
+def test_a_signal_ends_a_waiting_node_at_once_without_traceback(play, number):
+    play = play(roles=())
+    watched = []
+    with Watcher(watched.append, NAMESPACE) as watcher, process('record') as node:
+        end = time.monotonic() + PATIENCE
+        while not watched and time.monotonic() < end:
+            watcher.poll(0.1)
+        assert watched[0].role == 'record'
+        assert watched[0].settings_hash == ''
+        began = time.monotonic()
+        node.send_signal(number)
+        node.send_signal(number)  # a second one changes nothing
+        said = output(node)
+        seconds = time.monotonic() - began
+        watcher.poll(0.5)
+    assert node.returncode == 0, said
+    assert 'Traceback' not in said
+    assert f'stopped by {number.name}' in said
+    assert seconds < 3.0  # the interpreter's own end included, on a busy machine
+    assert watched[-1].finished
+
+
+def test_a_node_without_a_learner_names_it_and_gives_up(ros_domain):
+    with process('record', 'peer_deadline:=0.5') as node:
+        said = output(node)
+    assert node.returncode == 1
+    assert "/r/record gave up after 0.5 s: it waits for the learner, which announces a run on '/r/run'" in said
+    assert 'ros2 run learner_node learner' in said
+    assert 'Traceback' not in said
+
+
+def test_a_missing_role_is_named_with_what_starts_it(play):
+    play = play(roles=('learner', 'sim'))
+    with process('record', 'peer_deadline:=2.0') as node:
+        play.until(lambda: node.poll() is not None)
+        said = output(node)
+    assert node.returncode == 1
+    assert 'it waits for reward (start it with `ros2 run reward_node reward`' in said
+
+
+def test_a_node_takes_its_settings_from_the_run_and_shows_them(play):
+    play = play()
+    with process('record', 'delay:=7') as node:
+        play.until(lambda: any(p.settings_hash for p in play.presence_of('record')))
+        client = play.links['sim'].node.create_client(GetParameters, '/r/record/get_parameters')
+        play.until(client.service_is_ready)
+        future = client.call_async(GetParameters.Request(names=['task', 'delay', 'sac.hidden', 'bag']))
+        play.until(future.done)
+        task, delay, hidden, bag = future.result().values
+        assert task.string_value == play.settings.task
+        assert delay.integer_value == 7
+        assert list(hidden.integer_array_value) == [16, 16]
+        assert bag.string_value == ''
+        setter = play.links['sim'].node.create_client(SetParameters, '/r/record/set_parameters')
+        play.until(setter.service_is_ready)
+        future = setter.call_async(
+            SetParameters.Request(parameters=[Parameter('delay', value=8).to_parameter_msg()])
+        )
+        play.until(future.done)
+        assert not future.result().results[0].successful
+        node.terminate()
+        assert node.wait(PATIENCE) == 0
+
+
+def test_a_parameter_that_contradicts_the_run_stops_the_node_naming_both_values(play):
+    play = play()
+    with process('record', 'delay:=50') as node:
+        play.until(lambda: node.poll() is not None)
+        said = output(node)
+    assert node.returncode == 1
+    assert '/r/record: parameters contradict the run: delay = 50, but learner /r/learner has delay = 7' in said
+
+
+def test_an_unknown_parameter_stops_the_node_naming_it(ros_domain):
+    with process('record', 'dealy:=50') as node:
+        said = output(node)
+    assert node.returncode == 1
+    assert '/r/record has no parameter dealy=50' in said
+
+
+def test_another_protocol_version_is_refused(play):
+    play = play(roles=('learner',))
+    spec = play.spec
+    other = RunSpec('other', PROTOCOL_VERSION + 1, 0, spec.settings, spec.settings_hash)
+    play.links['learner'].publish(other)
+    with process('record', 'run_id:=other', 'peer_deadline:=4.0') as node:
+        play.until(lambda: node.poll() is not None)
+        said = output(node)
+    assert node.returncode == 1
+    assert f'speaks protocol_version {PROTOCOL_VERSION + 1}, /r/record speaks {PROTOCOL_VERSION}' in said
+    assert "run 'run' is not the one that /r/record was started for (parameter run_id = 'other')" in said
+
+
+def test_two_nodes_of_one_name_are_refused(play):
+    play = play(roles=('learner', 'sim'))
+    with process('record', name='sim') as node:
+        play.until(lambda: node.poll() is not None)
+        said = output(node)
+    assert node.returncode == 1
+    assert 'two nodes are called /r/sim' in said
+
+
+def test_a_second_learner_in_the_namespace_is_refused_naming_both_runs(play):
+    play = play(roles=('learner',), run_id='first')
+    with process('learner', 'run_id:=second', name='learner_2') as node:
+        play.until(lambda: node.poll() is not None)
+        said = output(node)
+    assert node.returncode == 1
+    assert "a second run in the namespace of /r/learner_2: 'first' beside 'second'" in said
+    specs = [m for m in play.messages('RunSpec') if m.run_id == 'second']
+    assert json.loads(specs[0].settings) == json.loads(load('quick').canonical())
+
+
+def test_a_peer_that_stops_before_the_run_is_over_is_named(play, monkeypatch):
+    play = play()
+    with process('record', 'peer_deadline:=3.0') as node:
+        play.until(lambda: everybody_matched(play))
+        play.links['sim'].publish(task_spec())
+        play.until(lambda: play.presence_of('record'))
+        # nobody says anything from now on
+        said = output(node)
+    assert node.returncode == 1
+    assert 'has been silent for' in said
+    assert 'permission for phase 0 from the learner' in said
+    assert '/r/learner' in said
+
+
+def test_commits_are_heard_by_who_comes_late(play):
+    play = play()
+    with process('record') as node:
+        play.until(lambda: everybody_matched(play))
+        one_phase(play)
+        heard = []
+        with Watcher(heard.append, NAMESPACE) as watcher:
+            end = time.monotonic() + PATIENCE
+            while not any(isinstance(r, Commit) for r in heard) and time.monotonic() < end:
+                watcher.poll(0.1)
+        assert [r.phase for r in heard if isinstance(r, Commit)] == [0]
+        node.terminate()
+        assert node.wait(PATIENCE) == 0

@@ -1,0 +1,93 @@
+import pytest
+
+rclpy = pytest.importorskip('rclpy', reason='needs ROS')
+
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from codetr_ros.config import Settings, load
+from codetr_ros.ros import parameters
+
+
+@pytest.fixture
+def make_node():
+    context = Context()
+    rclpy.init(context=context)
+    nodes = []
+
+    def make(**given):
+        overrides = [Parameter(name.replace('__', '.'), value=value) for name, value in given.items()]
+        nodes.append(
+            Node('n', namespace='/r', context=context, parameter_overrides=overrides, use_global_arguments=False)
+        )
+        return nodes[-1]
+
+    yield make
+    for node in nodes:
+        node.destroy_node()
+    context.try_shutdown()
+
+
+def test_every_setting_is_a_described_read_only_parameter_with_its_value(make_node):
+    node, settings = make_node(), load('paper')
+    parameters.declare_settings(node, settings)
+    for name, value in settings.flat().items():
+        shown = node.describe_parameter(name)
+        assert shown.description
+        assert shown.read_only
+        stored = node.get_parameter(name).value
+        if value is not None:
+            assert (tuple(stored) if isinstance(value, tuple) else stored) == value
+    refused = node.set_parameters([Parameter('delay', value=7)])[0]
+    assert not refused.successful
+    assert 'read-only' in refused.reason
+
+
+def test_ranges_and_choices_come_from_the_configuration():
+    delay = parameters.descriptor('delay').integer_range[0]
+    assert (delay.from_value, delay.to_value) == (1, 100_000)
+    discount = parameters.descriptor('sac.discount').floating_point_range[0]
+    assert (discount.from_value, discount.to_value) == (0.0, 1.0)
+    assert parameters.descriptor('composite').additional_constraints.startswith('one of: sum, ')
+    assert 'greater than 0' in parameters.descriptor('sac.tau').additional_constraints
+    assert '0: not given' in parameters.descriptor('r_max').additional_constraints
+
+
+def test_an_unknown_parameter_is_refused_with_its_name_and_value(make_node):
+    with pytest.raises(parameters.ParameterError, match="/r/n has no parameter dealy=7. There are: .*delay"):
+        parameters.check_names(make_node(dealy=7), 'learner')
+
+
+def test_a_parameter_of_another_role_is_unknown(make_node):
+    with pytest.raises(parameters.ParameterError, match="no parameter bag='x'"):
+        parameters.check_names(make_node(bag='x'), 'sim')
+    parameters.check_names(make_node(bag='x', use_sim_time=True), 'record')
+
+
+def test_the_learner_makes_its_settings_from_config_and_parameters(make_node):
+    node = make_node(delay=7, sac__hidden=[8, 9], sac__discount=1, r_max=0.0)
+    settings = parameters.own_settings(node, 'quick')
+    assert settings == load('quick').changed({'delay': 7, 'sac.hidden': (8, 9), 'sac.discount': 1.0})
+
+
+def test_a_setting_out_of_range_is_refused_by_name_and_value(make_node):
+    with pytest.raises(parameters.ParameterError, match='/r/n: parameter: delay = 0'):
+        parameters.own_settings(make_node(delay=0), 'quick')
+
+
+def test_a_parameter_that_contradicts_the_run_is_refused_naming_both_values_and_nodes(make_node):
+    settings = Settings(delay=25)
+    parameters.check_against_run(make_node(delay=25, sac__tau=0.005), settings, 'learner /r/learner')
+    with pytest.raises(parameters.ParameterError) as refused:
+        parameters.check_against_run(make_node(delay=50, seed=3), settings, 'learner /r/learner')
+    assert '/r/n' in str(refused.value)
+    assert 'delay = 50, but learner /r/learner has delay = 25' in str(refused.value)
+    assert 'seed = 3, but learner /r/learner has seed = 0' in str(refused.value)
+
+
+def test_own_parameters_have_types_and_ranges(make_node):
+    values = parameters.declare_own(make_node(run_id=5, peer_deadline=3), 'record')
+    assert values == {'run_id': '5', 'folder': '', 'peer_deadline': 3.0, 'bag': ''}
+    with pytest.raises(parameters.ParameterError, match='peer_deadline = -1 must be a number from 0'):
+        parameters.declare_own(make_node(peer_deadline=-1), 'sim')
