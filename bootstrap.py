@@ -39,6 +39,7 @@ from bootstrap_checks import (
 PIP = 'pip==26.3'
 """The pip that comes with Python 3.10 gives up on the requirements instead of resolving them."""
 REQUIREMENTS = ('requirements.txt', 'requirements-ros.txt', 'requirements-test.txt')
+WITHOUT_DEPENDENCIES = 'requirements-no-deps.txt'
 PACKAGES = ('msgs', 'codetr_ros', 'sim_node', 'reward_node', 'learner_node')
 
 FOREIGN = {
@@ -92,7 +93,10 @@ class Setup:
     def packages_hash(self):
         """Changes whenever other packages are asked for."""
         return digest(
-            [(name, (self.root / name).read_bytes()) for name in REQUIREMENTS]
+            [
+                (name, (self.root / name).read_bytes())
+                for name in (*REQUIREMENTS, WITHOUT_DEPENDENCIES)
+            ]
             + [('pip', PIP.encode())]
         )
 
@@ -185,7 +189,8 @@ class Setup:
         say('packages: 2 GB or more the first time, which takes some minutes')
         pip = [str(self.python), '-m', 'pip', '--disable-pip-version-check', 'install']
         everything = [word for name in REQUIREMENTS for word in ('-r', name)]
-        for arguments in ([PIP], everything):
+        bare = ['--no-deps', '-r', WITHOUT_DEPENDENCIES]
+        for arguments in ([PIP], everything, bare):
             code, output = self.call('packages', pip + arguments)
             if code:
                 if code > 0:

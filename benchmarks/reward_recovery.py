@@ -44,7 +44,7 @@ VARIANTS: dict[str, dict[str, object]] = {
     'label rhat': {'codetr.label': 'rhat'},
     'weights one': {'codetr.weights': 'one'},
     'head scale inverse': {'codetr.head_scale': 'inverse'},
-    'head scale inverse, label rhat': {'codetr.head_scale': 'inverse', 'codetr.label': 'rhat'},
+    'initialisation lecun': {'codetr.initialisation': 'lecun'},
     'head scale one': {'codetr.head_scale': 'one'},
     'pair tokens': {'codetr.tokens': 'pair'},
     'dropout 0.1': {'codetr.dropout': 0.1},

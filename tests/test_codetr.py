@@ -10,13 +10,14 @@ import torch
 from builders import ACTION as A
 from builders import OBSERVATION as O
 from codetr_ros.composite import composite
-from codetr_ros.config import Settings
 from codetr_ros.records import CompositeReward, Transitions
 from codetr_ros.rewards import RewardModelError
 from codetr_ros.rewards.codetr import STD_FLOOR, Codetr, learning_rate
 from codetr_ros.rewards.transformer import CausalSelfAttention, RewardTransformer
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.trajectories import SegmentBatch, Trajectories
+
+from codetr_ros.config import Settings
 
 DELAY = 6
 TOKENS = ('pair', 'merged')
@@ -140,7 +141,7 @@ def test_the_weight_of_a_step_depends_on_later_steps_of_its_segment():
     assert (np.abs(after[0] - before[0]) > 1e-7).all()
 
 
-@pytest.mark.parametrize('head_scale', ['inverse_sqrt', 'one'])
+@pytest.mark.parametrize('head_scale', ['inverse', 'inverse_sqrt', 'one'])
 @pytest.mark.parametrize('tokens', TOKENS)
 def test_the_weights_of_a_segment_are_positive_and_sum_to_its_steps(tokens, head_scale):
     data = memory()
@@ -181,7 +182,7 @@ def test_the_sum_of_weighted_rewards_is_the_sum_of_the_attention_outputs():
     )  # the terms differ, only the sums agree
 
 
-@pytest.mark.parametrize('head_scale', ['inverse_sqrt', 'one'])
+@pytest.mark.parametrize('head_scale', ['inverse', 'inverse_sqrt', 'one'])
 def test_the_weights_are_column_sums_of_a_plainly_written_attention(head_scale):
     torch.manual_seed(0)
     config = settings(head_scale=head_scale).codetr
@@ -190,7 +191,7 @@ def test_the_weights_are_column_sums_of_a_plainly_written_attention(head_scale):
     inside = torch.tensor([[True, True, True, False], [False, True, True, True]])
     found = head(x, inside)
     q, k = head.qk(x).detach().split(config.embedding, -1)
-    scale = 1 / math.sqrt(config.embedding) if head_scale == 'inverse_sqrt' else 1.0
+    scale = {'inverse': 1 / 16, 'inverse_sqrt': 1 / 4, 'one': 1.0}[head_scale]  # 16 wide
     for row in range(2):
         steps = torch.nonzero(inside[row]).flatten().tolist()
         expected = torch.zeros(4)

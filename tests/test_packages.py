@@ -113,7 +113,7 @@ def test_constants_of_messages_are_those_of_the_records():
     assert tuple(re.findall(r'string ROLE_\w+=(\w+)', text)) == records.ROLES
 
 
-@pytest.mark.parametrize('name', bootstrap.REQUIREMENTS)
+@pytest.mark.parametrize('name', [*bootstrap.REQUIREMENTS, bootstrap.WITHOUT_DEPENDENCIES])
 def test_each_requirement_is_pinned_exactly_has_its_reason_and_names_no_index(name: str):
     for line in (ROOT / name).read_text().splitlines():
         if line and not line.startswith('#'):

@@ -37,13 +37,13 @@ class Recorded(Setup):
         return (self.code, 'it broke') if stage == self.fail else (0, '')
 
 
-EVERYTHING = ['environment', 'packages', 'packages', 'workspace', 'check']
+EVERYTHING = ['environment', 'packages', 'packages', 'packages', 'workspace', 'check']
 
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     """A project folder with requirements and one message."""
-    for name in bootstrap.REQUIREMENTS:
+    for name in (*bootstrap.REQUIREMENTS, bootstrap.WITHOUT_DEPENDENCIES):
         (tmp_path / name).write_text('numpy==2.2.6\n')
     (tmp_path / 'msgs' / 'msg').mkdir(parents=True)
     (tmp_path / 'msgs' / 'msg' / 'Step.msg').write_text('uint32 step\n')
@@ -64,7 +64,7 @@ def test_a_new_folder_is_set_up_whole_and_then_not_touched_again(root: Path):
 def test_a_changed_requirement_reinstalls_and_rebuilds_in_the_same_environment(root: Path):
     stages(root)
     (root / 'requirements-ros.txt').write_text('numpy==2.2.5\n')
-    assert stages(root) == ['packages', 'packages', 'workspace', 'check']
+    assert stages(root) == EVERYTHING[1:]
 
 
 def test_a_changed_message_rebuilds_the_workspace_only(root: Path):
@@ -110,7 +110,7 @@ def test_an_interrupted_removal_of_an_environment_is_completed(root: Path):
 def test_an_installation_that_failed_by_itself_is_taken_up_where_it_was(root: Path):
     with pytest.raises(SetupError, match='it broke'):
         Recorded(root, fail='packages', code=1).run()
-    assert stages(root) == ['packages', 'packages', 'workspace', 'check']
+    assert stages(root) == EVERYTHING[1:]
 
 
 def test_an_interrupted_build_does_not_install_packages_again(root: Path):
@@ -135,7 +135,7 @@ def test_an_environment_of_another_python_or_place_is_made_anew(
 
 def test_an_environment_that_somebody_made_here_is_kept_and_completed(root: Path):
     Recorded(root).make_environment()
-    assert stages(root) == ['packages', 'packages', 'workspace', 'check']
+    assert stages(root) == EVERYTHING[1:]
 
 
 def test_an_environment_that_was_moved_here_is_made_anew(root: Path):

@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterator, Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -83,8 +83,13 @@ class CodetrSettings(Group):
     )
     head_scale: Literal['inverse', 'inverse_sqrt', 'one'] = Field(
         'inverse_sqrt',
-        description='factor on the in-sequence attention logits: 1/d, 1/sqrt(d) (decided here) '
+        description='factor on the in-sequence logits: 1/d, 1/sqrt(d) (decided here) '
         'or 1 (published code)',
+    )
+    initialisation: Literal['gpt2', 'lecun'] = Field(
+        'gpt2',
+        description='initial weights: small and nearly one step at a time as GPT-2 (decided here), '
+        'or of variance 1/inputs',
     )
     weights: Literal['attention', 'one'] = Field(
         'attention',
@@ -127,7 +132,7 @@ class CodetrSettings(Group):
 class SacSettings(Group):
     """Soft actor-critic as jaxrl has it (section 8 of the method)."""
 
-    hidden: tuple[int, ...] = Field(
+    hidden: tuple[Annotated[int, Field(ge=1, le=65536)], ...] = Field(
         (256, 256), min_length=1, max_length=8, description='hidden layer widths'
     )
     batch: int = Field(256, ge=1, le=65536, description='steps in an update')

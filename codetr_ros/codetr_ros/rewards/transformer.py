@@ -103,7 +103,8 @@ class SequenceWeights(nn.Module):
         super().__init__()
         d = settings.embedding
         self.qk = nn.Linear(d, 2 * d)
-        self.scale = {'inverse': 1 / d, 'inverse_sqrt': 1 / math.sqrt(d), 'one': 1.0}[settings.head_scale]
+        scales = {'inverse': 1 / d, 'inverse_sqrt': 1 / math.sqrt(d), 'one': 1.0}
+        self.scale = scales[settings.head_scale]
 
     def attention(self, x: Tensor, inside: Tensor) -> Tensor:
         """Softmax attention (B, L, L) among the steps `inside` (B, L); rows of others are 0."""
@@ -144,7 +145,7 @@ class RewardTransformer(nn.Module):
         attentive = settings.weights == 'attention'
         self.weights = SequenceWeights(settings) if attentive else UnitWeights()
         self.reward = nn.Linear(settings.embedding, 1)
-        self.apply(_initialise)
+        _initialise(self, settings)
 
     def forward(
         self, observations: Tensor, actions: Tensor, inside: Tensor
@@ -163,11 +164,26 @@ class RewardTransformer(nn.Module):
         return self.weights(x, inside), self.reward(x).squeeze(-1)
 
 
-def _initialise(module: nn.Module) -> None:
-    # Normal with variance 1/inputs, zero biases: the defaults of the Flax modules that the paper
-    # builds on. Torch's own embeddings, of variance 1, would drown observations and actions.
-    if isinstance(module, nn.Linear):
-        nn.init.normal_(module.weight, std=1 / math.sqrt(module.in_features))
-        nn.init.zeros_(module.bias)
-    elif isinstance(module, nn.Embedding):
-        nn.init.normal_(module.weight, std=1 / math.sqrt(module.embedding_dim))
+def _initialise(network: RewardTransformer, settings: CodetrSettings) -> None:
+    """Zero biases and normal weights.
+
+    'gpt2' (standard deviation 0.02, and 0.02 / sqrt(2 layers) where a block adds to its input)
+    begins close to a function of each step alone, to which training adds what earlier steps have
+    to say. 'lecun' (variance 1/inputs, the default of the Flax modules of the published code of
+    this family) begins with steps thoroughly mixed, and credit then stays on the wrong steps of a
+    segment, though its sum is right.
+    """
+    for module in network.modules():
+        if isinstance(module, nn.Linear):
+            width = module.in_features
+            nn.init.zeros_(module.bias)
+        elif isinstance(module, nn.Embedding):
+            width = module.embedding_dim
+        else:
+            continue
+        gpt2 = settings.initialisation == 'gpt2'
+        nn.init.normal_(module.weight, std=0.02 if gpt2 else 1 / math.sqrt(width))
+    if settings.initialisation == 'gpt2':
+        for block in network.causal.blocks:
+            for residual in (block.attention.out, block.mlp[-1]):
+                nn.init.normal_(residual.weight, std=0.02 / math.sqrt(2 * settings.layers))
