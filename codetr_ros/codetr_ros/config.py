@@ -88,7 +88,7 @@ class CodetrSettings(Group):
     )
     initialisation: Literal['gpt2', 'lecun'] = Field(
         'gpt2',
-        description='initial weights: small and nearly one step at a time as GPT-2 (decided here), '
+        description='initial weights: small, nearly one step at a time, as GPT-2 (decided here), '
         'or of variance 1/inputs',
     )
     weights: Literal['attention', 'one'] = Field(

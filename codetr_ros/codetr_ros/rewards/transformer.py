@@ -51,13 +51,15 @@ class Block(nn.Module):
         self.norm1 = nn.LayerNorm(d)
         self.attention = CausalSelfAttention(settings)
         self.norm2 = nn.LayerNorm(d)
-        self.mlp = nn.Sequential(nn.Linear(d, 4 * d), nn.ReLU(), nn.Linear(4 * d, d))
+        self.widen = nn.Linear(d, 4 * d)
+        self.narrow = nn.Linear(4 * d, d)
         self.dropout = nn.Dropout(settings.dropout)
 
     def forward(self, h: Tensor) -> Tensor:
         """Tokens (B, N, d) to tokens of the next layer (B, N, d)."""
         h = h + self.dropout(self.attention(self.norm1(h)))  # (B, N, d)
-        mixed: Tensor = h + self.dropout(self.mlp(self.norm2(h)))  # (B, N, d)
+        wide = F.relu(self.widen(self.norm2(h)))  # (B, N, 4d)
+        mixed: Tensor = h + self.dropout(self.narrow(wide))  # (B, N, d)
         return mixed
 
 
@@ -184,6 +186,7 @@ def _initialise(network: RewardTransformer, settings: CodetrSettings) -> None:
         gpt2 = settings.initialisation == 'gpt2'
         nn.init.normal_(module.weight, std=0.02 if gpt2 else 1 / math.sqrt(width))
     if settings.initialisation == 'gpt2':
-        for block in network.causal.blocks:
-            for residual in (block.attention.out, block.mlp[-1]):
-                nn.init.normal_(residual.weight, std=0.02 / math.sqrt(2 * settings.layers))
+        for block in network.modules():
+            if isinstance(block, Block):
+                for residual in (block.attention.out, block.narrow):
+                    nn.init.normal_(residual.weight, std=0.02 / math.sqrt(2 * settings.layers))
