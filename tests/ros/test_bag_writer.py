@@ -10,13 +10,12 @@ from builders import transitions
 pytest.importorskip('rclpy', reason='needs ROS')
 
 from builtin_interfaces.msg import Time
+from codetr_ros.bags.writer import BagError, BagTopic, McapWriter, schema_text, type_hash
+from codetr_ros.ros import messages
 from mcap.stream_reader import StreamReader
 from rclpy.serialization import serialize_message
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-from codetr_ros.bags.writer import BagError, BagTopic, McapWriter, schema_text, type_hash
-from codetr_ros.ros import messages
 
 TRANSITIONS = BagTopic('/r/transitions', 'codetr_msgs/msg/Transitions', 100, False)
 COMMITS = BagTopic('/r/commits', 'codetr_msgs/msg/Commit', 16, True)
@@ -55,7 +54,10 @@ def test_qos_and_type_hashes_are_those_that_rosbags_finds(tmp_path):
             found = by_topic[topic.name]
             assert found.digest == type_hash(topic.type)
             assert found.ext.offered_qos_profiles[0].depth == topic.depth
-        durabilities = [by_topic[t.name].ext.offered_qos_profiles[0].durability.name for t in (TRANSITIONS, COMMITS)]
+        durabilities = [
+            by_topic[t.name].ext.offered_qos_profiles[0].durability.name
+            for t in (TRANSITIONS, COMMITS)
+        ]
         assert durabilities == ['VOLATILE', 'TRANSIENT_LOCAL']
 
 
@@ -70,7 +72,9 @@ def test_type_hashes_agree_with_what_rosbags_computes_from_the_schema():
 
 def test_a_schema_holds_all_that_the_type_contains_once():
     text = schema_text('diagnostic_msgs/msg/DiagnosticArray').decode()
-    contained = [line.removeprefix('MSG: ') for line in text.splitlines() if line.startswith('MSG: ')]
+    contained = [
+        line.removeprefix('MSG: ') for line in text.splitlines() if line.startswith('MSG: ')
+    ]
     assert contained == [
         'std_msgs/Header', 'builtin_interfaces/Time', 'diagnostic_msgs/DiagnosticStatus', 'diagnostic_msgs/KeyValue',
     ]  # fmt: skip
@@ -132,7 +136,10 @@ CHILD = """
 def child(folder, body: str) -> subprocess.Popen:
     head = textwrap.dedent(CHILD).format(paths=sys.path, folder=str(folder))
     return subprocess.Popen(
-        [sys.executable, '-c', head + textwrap.dedent(body)], stdout=subprocess.PIPE, text=True, env=os.environ
+        [sys.executable, '-c', head + textwrap.dedent(body)],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ,
     )
 
 

@@ -7,8 +7,6 @@ from builders import same, transitions
 pytest.importorskip('rclpy', reason='needs ROS')
 
 from builtin_interfaces.msg import Time
-from rclpy.serialization import deserialize_message, serialize_message
-
 from codetr_ros.records import (
     TOPICS,
     Commit,
@@ -25,9 +23,12 @@ from codetr_ros.records import (
     TrueRewards,
 )
 from codetr_ros.ros import messages, peers, qos
+from rclpy.serialization import deserialize_message, serialize_message
 
 STAMP = Time(sec=3, nanosec=4)
-ODD = np.array([0.1, -0.0, 1e-45, np.nan, np.inf], np.float32)  # a sign, a denormal, what is no number
+ODD = np.array(
+    [0.1, -0.0, 1e-45, np.nan, np.inf], np.float32
+)  # a sign, a denormal, what is no number
 
 EXAMPLES = {
     RunSpec: RunSpec('r', 1, 7, '{"ä": 1}', 'ab'),

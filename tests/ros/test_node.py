@@ -15,6 +15,10 @@ from builders import policy, score, task_spec, tiny, transitions
 rclpy = pytest.importorskip('rclpy', reason='needs ROS')
 
 from codetr_msgs.srv import FetchPhase
+from codetr_ros.records import PROTOCOL_VERSION, TOPICS, Commit, Presence, RunSpec, StepRewards
+from codetr_ros.ros import peers
+from codetr_ros.ros.link import Link
+from codetr_ros.ros.watch import Watcher
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter
@@ -23,10 +27,6 @@ from rosbags.highlevel import AnyReader
 
 from codetr_ros import run_folder
 from codetr_ros.config import load
-from codetr_ros.records import PROTOCOL_VERSION, TOPICS, Commit, Presence, RunSpec, StepRewards
-from codetr_ros.ros import peers
-from codetr_ros.ros.link import Link
-from codetr_ros.ros.watch import Watcher
 
 ROOT = Path(__file__).resolve().parents[2]
 MODULES = {
@@ -70,7 +70,11 @@ class Play:
             link.advertise(['presence', *peers.published_by(role)], settings)
             for kind in TOPICS:
                 if role in peers.READERS.get(TOPICS[kind], ()) or kind in (Presence, RunSpec):
-                    link.subscribe(kind, lambda kind, message, role=role: self.heard.append((role, message)), settings)
+                    link.subscribe(
+                        kind,
+                        lambda kind, message, role=role: self.heard.append((role, message)),
+                        settings,
+                    )
         self.finished = False
         self.claimed = {}
         if 'learner' in roles:
@@ -87,10 +91,11 @@ class Play:
                 )
             )  # fmt: skip
 
-    def until(self, found, patience=PATIENCE):
+    def until(self, found, node=None):
         """Spin, saying presence, until `found()` is true; returns what it returns."""
-        end, said = time.monotonic() + patience, 0.0
+        end, said = time.monotonic() + PATIENCE, 0.0
         while time.monotonic() < end:
+            assert node is None or node.poll() is None, output(node)
             if time.monotonic() - said > 0.3:
                 said = time.monotonic()
                 self.say()
@@ -100,13 +105,19 @@ class Play:
                     link.inbox.popleft()()
             if result := found():
                 return result
-        raise AssertionError(f'not within {patience} s; heard {[type(m).__name__ for _, m in self.heard][-20:]}')
+        raise AssertionError(
+            f'not within {PATIENCE} s; heard {[type(m).__name__ for _, m in self.heard][-20:]}'
+        )
 
     def messages(self, kind, role=None):
         return [m for r, m in self.heard if type(m).__name__ == kind and role in (None, r)]
 
     def presence_of(self, role):
-        return [m for m in self.messages('Presence') if m.role == role and 'of the test' not in m.instance_id]
+        return [
+            m
+            for m in self.messages('Presence')
+            if m.role == role and 'of the test' not in m.instance_id
+        ]
 
     def close(self):
         for link in self.links.values():
@@ -116,10 +127,15 @@ class Play:
 @pytest.fixture
 def play(ros_domain):
     made = []
-    rclpy.init(args=['test', '--ros-args', '-r', f'__ns:={NAMESPACE}'], signal_handler_options=SignalHandlerOptions.NO)
+    rclpy.init(
+        args=['test', '--ros-args', '-r', f'__ns:={NAMESPACE}'],
+        signal_handler_options=SignalHandlerOptions.NO,
+    )
 
     def start(**options):
-        settings = options.pop('settings', tiny(steps=5, phase_steps=5, warmup_steps=5, evaluate_every=0))
+        settings = options.pop(
+            'settings', tiny(steps=5, phase_steps=5, warmup_steps=5, evaluate_every=0)
+        )
         made.append(Play(settings, **options))
         return made[-1]
 
@@ -142,14 +158,18 @@ def one_phase(play):
 def everybody_matched(play):
     """Whether the recorder reads what the test publishes."""
     return not play.links['sim'].unmatched(
-        ['transitions', 'composite_rewards', 'task'], lambda _: {f'{NAMESPACE}/record'}, readers=True
-    ) and not play.links['reward'].unmatched(['step_rewards'], lambda _: {f'{NAMESPACE}/record'}, readers=True)
+        ['transitions', 'composite_rewards', 'task'],
+        lambda _: {f'{NAMESPACE}/record'},
+        readers=True,
+    ) and not play.links['reward'].unmatched(
+        ['step_rewards'], lambda _: {f'{NAMESPACE}/record'}, readers=True
+    )
 
 
 def test_a_recorder_commits_a_phase_and_keeps_every_byte_of_it(play, tmp_path):
     play = play()
     with process('record', f'folder:={tmp_path}', 'peer_deadline:=30.0') as node:
-        play.until(lambda: everybody_matched(play))
+        play.until(lambda: everybody_matched(play), node)
         commit = one_phase(play)
         assert (commit.phase, list(commit.sources), list(commit.transitions)) == (0, ['sim'], [0])
         segment = [np.array([n], np.uint32) for n in (0, 0, 5)]
@@ -178,7 +198,7 @@ def test_a_recorder_commits_a_phase_and_keeps_every_byte_of_it(play, tmp_path):
 def test_what_was_published_and_never_came_is_reported_as_lost(play, tmp_path):
     play = play()
     with process('record', f'folder:={tmp_path}', 'peer_deadline:=3.0') as node:
-        play.until(lambda: everybody_matched(play))
+        play.until(lambda: everybody_matched(play), node)
         one_phase(play)
         play.claimed = {'step_rewards': 2}
         play.finished = True
@@ -192,7 +212,7 @@ def test_what_was_published_and_never_came_is_reported_as_lost(play, tmp_path):
 def test_a_committed_phase_is_sent_again_and_another_refused_with_the_reason(play):
     play = play()
     with process('record') as node:
-        play.until(lambda: everybody_matched(play))
+        play.until(lambda: everybody_matched(play), node)
         one_phase(play)
         client = play.links['learner'].node.create_client(FetchPhase, 'fetch_phase')
         play.until(client.service_is_ready)
@@ -217,11 +237,13 @@ def test_a_committed_phase_is_sent_again_and_another_refused_with_the_reason(pla
 def test_what_must_be_refused_is_counted_and_changes_nothing(play, tmp_path):
     play = play()
     with process('record', f'folder:={tmp_path}') as node:
-        play.until(lambda: everybody_matched(play))
+        play.until(lambda: everybody_matched(play), node)
         play.links['sim'].publish(transitions(run_id='another'))
         one_phase(play)
         diagnostics = []
-        play.links['sim'].node.create_subscription(DiagnosticArray, '/diagnostics', diagnostics.append, 10)
+        play.links['sim'].node.create_subscription(
+            DiagnosticArray, '/diagnostics', diagnostics.append, 10
+        )
         status = play.until(
             lambda: [s for a in diagnostics for s in a.status if s.name == '/r/record: messages']
         )[0]
@@ -261,7 +283,10 @@ def test_a_node_without_a_learner_names_it_and_gives_up(ros_domain):
     with process('record', 'peer_deadline:=0.5') as node:
         said = output(node)
     assert node.returncode == 1
-    assert "/r/record gave up after 0.5 s: it waits for the learner, which announces a run on '/r/run'" in said
+    assert (
+        "/r/record gave up after 0.5 s: it waits for the learner, which announces a run on '/r/run'"
+        in said
+    )
     assert 'ros2 run learner_node learner' in said
     assert 'Traceback' not in said
 
@@ -281,7 +306,9 @@ def test_a_node_takes_its_settings_from_the_run_and_shows_them(play):
         play.until(lambda: any(p.settings_hash for p in play.presence_of('record')))
         client = play.links['sim'].node.create_client(GetParameters, '/r/record/get_parameters')
         play.until(client.service_is_ready)
-        future = client.call_async(GetParameters.Request(names=['task', 'delay', 'sac.hidden', 'bag']))
+        future = client.call_async(
+            GetParameters.Request(names=['task', 'delay', 'sac.hidden', 'bag'])
+        )
         play.until(future.done)
         task, delay, hidden, bag = future.result().values
         assert task.string_value == play.settings.task
@@ -305,7 +332,10 @@ def test_a_parameter_that_contradicts_the_run_stops_the_node_naming_both_values(
         play.until(lambda: node.poll() is not None)
         said = output(node)
     assert node.returncode == 1
-    assert '/r/record: parameters contradict the run: delay = 50, but learner /r/learner has delay = 7' in said
+    assert (
+        '/r/record: parameters contradict the run: delay = 50, but learner /r/learner has delay = 7'
+        in said
+    )
 
 
 def test_an_unknown_parameter_stops_the_node_naming_it(ros_domain):
@@ -324,8 +354,14 @@ def test_another_protocol_version_is_refused(play):
         play.until(lambda: node.poll() is not None)
         said = output(node)
     assert node.returncode == 1
-    assert f'speaks protocol_version {PROTOCOL_VERSION + 1}, /r/record speaks {PROTOCOL_VERSION}' in said
-    assert "run 'run' is not the one that /r/record was started for (parameter run_id = 'other')" in said
+    assert (
+        f'speaks protocol_version {PROTOCOL_VERSION + 1}, /r/record speaks {PROTOCOL_VERSION}'
+        in said
+    )
+    assert (
+        "run 'run' is not the one that /r/record was started for (parameter run_id = 'other')"
+        in said
+    )
 
 
 def test_two_nodes_of_one_name_are_refused(play):
@@ -348,10 +384,10 @@ def test_a_second_learner_in_the_namespace_is_refused_naming_both_runs(play):
     assert json.loads(specs[0].settings) == json.loads(load('quick').canonical())
 
 
-def test_a_peer_that_stops_before_the_run_is_over_is_named(play, monkeypatch):
+def test_a_peer_that_stops_before_the_run_is_over_is_named(play):
     play = play()
     with process('record', 'peer_deadline:=3.0') as node:
-        play.until(lambda: everybody_matched(play))
+        play.until(lambda: everybody_matched(play), node)
         play.links['sim'].publish(task_spec())
         play.until(lambda: play.presence_of('record'))
         # nobody says anything from now on
@@ -365,7 +401,7 @@ def test_a_peer_that_stops_before_the_run_is_over_is_named(play, monkeypatch):
 def test_commits_are_heard_by_who_comes_late(play):
     play = play()
     with process('record') as node:
-        play.until(lambda: everybody_matched(play))
+        play.until(lambda: everybody_matched(play), node)
         one_phase(play)
         heard = []
         with Watcher(heard.append, NAMESPACE) as watcher:

@@ -2,12 +2,12 @@ import pytest
 
 rclpy = pytest.importorskip('rclpy', reason='needs ROS')
 
+from codetr_ros.ros import parameters
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from codetr_ros.config import Settings, load
-from codetr_ros.ros import parameters
 
 
 @pytest.fixture
@@ -17,9 +17,17 @@ def make_node():
     nodes = []
 
     def make(**given):
-        overrides = [Parameter(name.replace('__', '.'), value=value) for name, value in given.items()]
+        overrides = [
+            Parameter(name.replace('__', '.'), value=value) for name, value in given.items()
+        ]
         nodes.append(
-            Node('n', namespace='/r', context=context, parameter_overrides=overrides, use_global_arguments=False)
+            Node(
+                'n',
+                namespace='/r',
+                context=context,
+                parameter_overrides=overrides,
+                use_global_arguments=False,
+            )
         )
         return nodes[-1]
 
@@ -55,7 +63,9 @@ def test_ranges_and_choices_come_from_the_configuration():
 
 
 def test_an_unknown_parameter_is_refused_with_its_name_and_value(make_node):
-    with pytest.raises(parameters.ParameterError, match="/r/n has no parameter dealy=7. There are: .*delay"):
+    with pytest.raises(
+        parameters.ParameterError, match='/r/n has no parameter dealy=7. There are: .*delay'
+    ):
         parameters.check_names(make_node(dealy=7), 'learner')
 
 
@@ -68,7 +78,9 @@ def test_a_parameter_of_another_role_is_unknown(make_node):
 def test_the_learner_makes_its_settings_from_config_and_parameters(make_node):
     node = make_node(delay=7, sac__hidden=[8, 9], sac__discount=1, r_max=0.0)
     settings = parameters.own_settings(node, 'quick')
-    assert settings == load('quick').changed({'delay': 7, 'sac.hidden': (8, 9), 'sac.discount': 1.0})
+    assert settings == load('quick').changed(
+        {'delay': 7, 'sac.hidden': (8, 9), 'sac.discount': 1.0}
+    )
 
 
 def test_a_setting_out_of_range_is_refused_by_name_and_value(make_node):
@@ -78,7 +90,9 @@ def test_a_setting_out_of_range_is_refused_by_name_and_value(make_node):
 
 def test_a_parameter_that_contradicts_the_run_is_refused_naming_both_values_and_nodes(make_node):
     settings = Settings(delay=25)
-    parameters.check_against_run(make_node(delay=25, sac__tau=0.005), settings, 'learner /r/learner')
+    parameters.check_against_run(
+        make_node(delay=25, sac__tau=0.005), settings, 'learner /r/learner'
+    )
     with pytest.raises(parameters.ParameterError) as refused:
         parameters.check_against_run(make_node(delay=50, seed=3), settings, 'learner /r/learner')
     assert '/r/n' in str(refused.value)
@@ -89,5 +103,7 @@ def test_a_parameter_that_contradicts_the_run_is_refused_naming_both_values_and_
 def test_own_parameters_have_types_and_ranges(make_node):
     values = parameters.declare_own(make_node(run_id=5, peer_deadline=3), 'record')
     assert values == {'run_id': '5', 'folder': '', 'peer_deadline': 3.0, 'bag': ''}
-    with pytest.raises(parameters.ParameterError, match='peer_deadline = -1 must be a number from 0'):
+    with pytest.raises(
+        parameters.ParameterError, match='peer_deadline = -1 must be a number from 0'
+    ):
         parameters.declare_own(make_node(peer_deadline=-1), 'sim')

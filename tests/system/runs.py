@@ -6,10 +6,13 @@ import json
 import os
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import yaml
+
 from codetr_ros.config import Settings
 
 CODETR = Path(sys.prefix) / 'bin' / 'codetr'
@@ -20,18 +23,29 @@ def train(
     settings: Settings, folder: Path, *flags: str, code: int = 0
 ) -> tuple[dict[str, Any], str]:
     """Run `codetr train` to its end; its summary and what it printed."""
+    return finish(start(write(settings, folder), folder, *flags), folder, code)
+
+
+def write(settings: Settings, folder: Path) -> Path:
+    """Write settings to a file beside a run's folder."""
     config = folder.with_suffix('.yaml')
     config.write_text(yaml.safe_dump(settings.model_dump(mode='json')))
-    done = start(config, folder, *flags)
+    return config
+
+
+def finish(
+    started: 'subprocess.Popen[str]', folder: Path, code: int = 0
+) -> tuple[dict[str, Any], str]:
+    """Wait until `codetr train` has ended; its summary and what it printed."""
     try:
-        said, _ = done.communicate(timeout=DEADLINE)
+        said, _ = started.communicate(timeout=DEADLINE)
     except subprocess.TimeoutExpired:
-        done.kill()
-        said, _ = done.communicate()
+        started.kill()
+        said, _ = started.communicate()
         raise AssertionError(
             f'codetr train took more than {DEADLINE} s:\n{said}\n{logs(folder)}'
         ) from None
-    assert done.returncode == code, f'{said}\n{logs(folder)}'
+    assert started.returncode == code, f'{said}\n{logs(folder)}'
     return json.loads((folder / 'summary.json').read_text()), said
 
 
@@ -52,3 +66,29 @@ def logs(folder: Path) -> str:
     """The ends of all nodes' logs, for a failing test."""
     found = sorted((folder / 'logs').glob('*.log')) if folder.exists() else []
     return '\n'.join(f'--- {path.name}\n{path.read_text()[-2000:]}' for path in found)
+
+
+def until(found: Callable[[], bool], command: 'subprocess.Popen[str]', folder: Path) -> None:
+    """Wait until `found()` is true, as long as a command runs."""
+    end = time.monotonic() + DEADLINE
+    while not found():
+        try:
+            code = command.wait(0.1)
+        except subprocess.TimeoutExpired:
+            assert time.monotonic() < end, f'not within {DEADLINE} s\n{logs(folder)}'
+        else:
+            raise AssertionError(f'ended with {code}:\n{command.stdout.read()}\n{logs(folder)}')
+
+
+def processes_of(folder: Path) -> list[tuple[int, str]]:
+    """Number and command line of each process that has something to do with a run's folder."""
+    found = []
+    for entry in Path('/proc').iterdir():
+        if entry.name.isdigit() and int(entry.name) != os.getpid():
+            try:
+                words = (entry / 'cmdline').read_bytes().replace(b'\0', b' ').decode()
+            except OSError:
+                continue  # it has ended meanwhile
+            if str(folder) in words:
+                found.append((int(entry.name), words))
+    return found

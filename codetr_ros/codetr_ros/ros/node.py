@@ -528,7 +528,7 @@ class CoreNode:
         run_folder.write_report(self.folder, self.role, self.link.name, report)
 
     def _goodbye(self) -> None:
-            self.log.warning(f'not everybody has received all of {", ".join(late)}')
+        """Say the last word, and stay until the readers have everything or have finished too.
 
         A reader that lacks something is served again by this process only. The middleware asks
         whether it does with every few messages, else only every 3 s: waiting for its answer alone
