@@ -51,7 +51,7 @@ METHODS = {
 RANDOM = 'random'
 STYLES = {  # colour (Okabe and Ito: told apart by all), marker, line
     'codetr': ('#D55E00', 'o', '-'),
-    'true': ('#000000', 's', '--'),
+    'true': ('#000000', 's', '-.'),
     'uniform': ('#0072B2', '^', '-'),
     'ones': ('#009E73', 'v', '-'),
     'none': ('#CC79A7', 'D', '-'),
@@ -336,7 +336,7 @@ def plot(arguments: argparse.Namespace) -> None:
         axes.fill_between(steps, lowest, highest, color=colour, alpha=0.13, linewidth=0)
     if random := [one['final_true_return'] for one in random_of(runs)]:
         level = statistics.fmean(random)
-        axes.axhline(level, color='#777777', linestyle=':', linewidth=1.7, label='random policy')
+        axes.axhline(level, color='#777777', linestyle='--', linewidth=1.7, label='random policy')
     seeds = {len(some) for some in by_method(runs).values()}
     counted = f'{min(seeds)} to {max(seeds)}' if len(seeds) > 1 else str(min(seeds))
     axes.set_title(

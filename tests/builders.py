@@ -4,7 +4,6 @@ from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
-from codetr_ros.config import Settings, load
 from codetr_ros.records import (
     PROTOCOL_VERSION,
     Commit,
@@ -15,6 +14,8 @@ from codetr_ros.records import (
     TaskSpec,
     Transitions,
 )
+
+from codetr_ros.config import Settings, load
 
 OBSERVATION, ACTION = 3, 2
 
@@ -97,6 +98,13 @@ def step_rewards(**changes: Any) -> StepRewards:
     return replace(
         StepRewards('run', 0, 1, 0, 1, 'sim', *segment, np.arange(5, dtype=np.float32)), **changes
     )
+
+
+def follow(before: Transitions) -> np.ndarray:
+    """Observations of five steps that begin where `before` ended."""
+    observations = transitions().observations.copy()
+    observations[0] = before.observations[-1]
+    return observations
 
 
 def same(a: Any, b: Any) -> bool:

@@ -1,23 +1,35 @@
-"""Every test session has a ROS domain of its own, on this host only, before rclpy is imported."""
+"""Tests of the ROS layer and of whole runs have a ROS domain of their own, on this host only."""
 
+import importlib.util
 import os
+from collections.abc import Iterator
 
+# before anything imports rclpy
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
 import pytest
 
+ROS = importlib.util.find_spec('rclpy') is not None
+collect_ignore_glob = [] if ROS else ['ros/*', 'system/*']
+
+
+def pytest_report_header() -> str:
+    return (
+        'ROS: found' if ROS else 'ROS: rclpy is missing, tests/ros and tests/system are left out'
+    )
+
 
 @pytest.fixture
-def ros_domain(monkeypatch: pytest.MonkeyPatch) -> int:
-    """A ROS domain that no other test uses at the same time, for this test and its processes."""
-    coordinator = pytest.importorskip('domain_coordinator', reason='needs ROS')
-    with coordinator.domain_id() as domain:
+def ros_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """A ROS domain that nobody else uses meanwhile, for this test and its processes."""
+    from domain_coordinator import domain_id
+
+    with domain_id() as domain:
         monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
         yield int(domain)
 
 
 @pytest.fixture(autouse=True)
 def _own_ros_domain(request: pytest.FixtureRequest) -> None:
-    """Tests of the ROS layer and of whole runs get their domain without asking."""
     if {'ros', 'system'} & set(request.path.parent.parts):
         request.getfixturevalue('ros_domain')

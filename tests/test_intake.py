@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import ACTION, OBSERVATION, commit, run, score, task_spec, tiny, transitions
+from builders import ACTION, OBSERVATION, commit, follow, run, score, task_spec, tiny, transitions
 from codetr_ros.intake import Intake
 from codetr_ros.records import RecordError
 from codetr_ros.trajectories import Trajectories
@@ -89,12 +89,6 @@ def test_what_belongs_to_a_later_phase_waits_outside():
     assert it.take(0, m) and m.steps == 5
     it.receive(commit(phase=1, transitions=last(1)))
     assert it.take(1, m) and m.steps == 10
-
-
-def follow(before) -> np.ndarray:
-    observations = transitions().observations.copy()
-    observations[0] = before.observations[-1]
-    return observations
 
 
 def test_the_order_of_arrival_does_not_matter():

@@ -1,6 +1,7 @@
-"""The five nodes of a run in one namespace: `ros2 launch codetr_ros train.launch.py config:=quick`.
+"""The nodes of a run in one namespace: `ros2 launch codetr_ros train.launch.py config:=quick`.
 
-The nodes start in any order and wait for each other; the launch ends when the recorder has, which is last.
+They start in any order and wait for each other; the launch ends when the recorder has, which is
+last.
 """
 
 from launch import LaunchDescription

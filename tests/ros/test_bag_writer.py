@@ -6,9 +6,6 @@ import textwrap
 
 import pytest
 from builders import transitions
-
-pytest.importorskip('rclpy', reason='needs ROS')
-
 from builtin_interfaces.msg import Time
 from codetr_ros.bags.writer import BagError, BagTopic, McapWriter, schema_text, type_hash
 from codetr_ros.ros import messages
@@ -76,7 +73,8 @@ def test_a_schema_holds_all_that_the_type_contains_once():
         line.removeprefix('MSG: ') for line in text.splitlines() if line.startswith('MSG: ')
     ]
     assert contained == [
-        'std_msgs/Header', 'builtin_interfaces/Time', 'diagnostic_msgs/DiagnosticStatus', 'diagnostic_msgs/KeyValue',
+        'std_msgs/Header', 'builtin_interfaces/Time',
+        'diagnostic_msgs/DiagnosticStatus', 'diagnostic_msgs/KeyValue',
     ]  # fmt: skip
 
 

@@ -10,10 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rclpy
 from builders import policy, score, task_spec, tiny, transitions
-
-rclpy = pytest.importorskip('rclpy', reason='needs ROS')
-
 from codetr_msgs.srv import FetchPhase
 from codetr_ros.records import PROTOCOL_VERSION, TOPICS, Commit, Presence, RunSpec, StepRewards
 from codetr_ros.ros import peers
@@ -86,7 +84,8 @@ class Play:
             counts = [link.published[t] + self.claimed.get(t, 0) for t in topics]
             link.publish(
                 Presence(
-                    self.spec.run_id, role, link.full_name, f'{role} of the test', self.spec.settings_hash,
+                    self.spec.run_id, role, link.full_name, f'{role} of the test',
+                    self.spec.settings_hash,
                     self.finished, topics, np.array(counts, np.uint64),
                 )
             )  # fmt: skip
@@ -284,8 +283,7 @@ def test_a_node_without_a_learner_names_it_and_gives_up(ros_domain):
         said = output(node)
     assert node.returncode == 1
     assert (
-        "/r/record gave up after 0.5 s: it waits for the learner, which announces a run on '/r/run'"
-        in said
+        "gave up after 0.5 s: it waits for the learner, which announces a run on '/r/run'" in said
     )
     assert 'ros2 run learner_node learner' in said
     assert 'Traceback' not in said
@@ -333,8 +331,7 @@ def test_a_parameter_that_contradicts_the_run_stops_the_node_naming_both_values(
         said = output(node)
     assert node.returncode == 1
     assert (
-        '/r/record: parameters contradict the run: delay = 50, but learner /r/learner has delay = 7'
-        in said
+        'parameters contradict the run: delay = 50, but learner /r/learner has delay = 7' in said
     )
 
 

@@ -1,7 +1,5 @@
 import pytest
-
-rclpy = pytest.importorskip('rclpy', reason='needs ROS')
-
+import rclpy
 from codetr_ros.ros import parameters
 from rclpy.context import Context
 from rclpy.node import Node

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
-from codetr_ros.records import TOPICS, Commit, Presence, Record
+from codetr_ros.records import TOPICS, Commit, CompositeReward, Presence, Record
 from codetr_ros.ros import messages, qos
 from codetr_ros.ros.link import Link
 from diagnostic_msgs.msg import DiagnosticArray
@@ -110,6 +110,7 @@ class Witness:
         self._nodes = nodes
         self.presence: dict[str, Presence] = {}
         self.commits: list[Commit] = []
+        self.scores: list[CompositeReward] = []
         self.counters: dict[str, dict[str, str]] = {}
 
     def __enter__(self) -> 'Witness':
@@ -120,6 +121,7 @@ class Witness:
         self.link = Link('witness')
         self.link.subscribe(Presence, self._hear)
         self.link.subscribe(Commit, lambda _, message: self.commits.append(message))
+        self.link.subscribe(CompositeReward, self._scored)
         self.link.node.create_subscription(
             DiagnosticArray,
             '/diagnostics',
@@ -134,6 +136,9 @@ class Witness:
 
     def _hear(self, _: type, said: Presence) -> None:
         self.presence[said.node.rsplit('/', 1)[1]] = said
+
+    def _scored(self, _: type, message: Any) -> None:
+        self.scores.append(messages.from_message(message))
 
     def _diagnosed(self, array: DiagnosticArray) -> None:
         for status in array.status:

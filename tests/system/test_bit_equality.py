@@ -2,29 +2,50 @@
 altered.
 """
 
+from typing import Any
+
 import pytest
 from builders import tiny
+from codetr_ros.summary import Summary
 from system.runs import train
+
+from codetr_ros import in_process
+from codetr_ros.config import Settings
 
 # Episodes of the pendulum end early and at any step; those of the reacher at 50. Segments of 7
 # steps fit into neither a phase of 200 steps nor an episode of 50.
-TASKS = ('InvertedDoublePendulum-v5', 'Reacher-v5')
+PENDULUM, REACHER = 'InvertedDoublePendulum-v5', 'Reacher-v5'
+# Every pair of task and method, task and pace, method and pace.
+PAIRS = [
+    (PENDULUM, 'codetr', 'lock-step'),
+    (PENDULUM, 'none', 'overlap'),
+    (REACHER, 'codetr', 'overlap'),
+    (REACHER, 'none', 'lock-step'),
+]
 
 
-@pytest.mark.parametrize('overlap', [False, True], ids=['lock-step', 'overlap'])
-@pytest.mark.parametrize('method', ['codetr', 'none'])
-@pytest.mark.parametrize('task', TASKS)
-def test_over_topics_and_in_process_end_with_the_same_weights(tmp_path, task, method, overlap):
-    settings = tiny(task=task, method=method, overlap=overlap, delay=7)
+def by_calls(settings: Settings) -> dict[str, Any]:
+    """The summary of a run in this process, which is not even that of `codetr train`."""
+    summary = Summary(settings, 'calls', True)
+    reports = in_process.run(settings, 'calls', observe=summary.receive)
+    return summary.build(reports, None, False, None)
+
+
+def check_same(topics: dict[str, Any], calls: dict[str, Any]) -> None:
+    """Compare what two runs have learnt."""
+    for what in ('policy_sha256', 'reward_model_sha256', 'evaluations', 'random_score'):
+        assert topics[what] == calls[what], what
+    assert topics['policy_sha256']
+
+
+@pytest.mark.parametrize(('task', 'method', 'pace'), PAIRS)
+def test_over_topics_and_in_process_end_with_the_same_weights(tmp_path, task, method, pace):
+    settings = tiny(task=task, method=method, overlap=pace == 'overlap', delay=7)
     topics, _ = train(settings, tmp_path / 'topics')
-    calls, _ = train(settings, tmp_path / 'calls', '--in-process')
-    assert topics['policy_sha256'] == calls['policy_sha256']
-    assert topics['reward_model_sha256'] == calls['reward_model_sha256']
-    assert topics['evaluations'] == calls['evaluations']
-    assert topics['random_score'] == calls['random_score']
+    check_same(topics, by_calls(settings))
 
 
-def test_another_seed_pace_or_method_ends_with_other_weights(tmp_path):
+def test_another_seed_pace_or_method_ends_with_other_weights():
     """What the equality above would miss if the digests were of something else."""
     changes = (
         {},
@@ -33,17 +54,11 @@ def test_another_seed_pace_or_method_ends_with_other_weights(tmp_path):
         {'method': 'none'},
         {'codetr.learning_rate': 2e-3},
     )
-    digests = set()
-    for i, change in enumerate(changes):
-        settings = tiny().changed(change)
-        summary, _ = train(settings, tmp_path / str(i), '--in-process')
-        digests.add(summary['policy_sha256'])
+    digests = {by_calls(tiny().changed(change))['policy_sha256'] for change in changes}
     assert len(digests) == len(changes)
 
 
 def test_two_simulators_over_topics_equal_two_in_process(tmp_path):
-    settings = tiny(simulators=2, task='Reacher-v5')
+    settings = tiny(simulators=2, task=REACHER)
     topics, _ = train(settings, tmp_path / 'topics')
-    calls, _ = train(settings, tmp_path / 'calls', '--in-process')
-    assert topics['policy_sha256'] == calls['policy_sha256']
-    assert topics['reward_model_sha256'] == calls['reward_model_sha256']
+    check_same(topics, by_calls(settings))

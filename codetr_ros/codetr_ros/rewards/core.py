@@ -98,8 +98,8 @@ class Labeller:
             if phase < settings.warmup_phases - 1:
                 self._phase = phase + 1
                 continue
-            if phase == settings.warmup_phases - 1:
-                method.prepare(memory)
+            if method.target_scale == 0 and len(memory.segment_ids()):
+                method.prepare(memory)  # once; later where nothing was scored in the warm-up
             metrics: dict[str, float] = {}
             for said in self._fit(phase, memory, method):
                 metrics |= said
@@ -130,10 +130,9 @@ class Labeller:
         self, phase: int, memory: Trajectories, method: rewards.RewardMethod
     ) -> Iterator[dict[str, float]]:
         codetr = self._settings.codetr
-        first = phase == self._settings.warmup_phases - 1 or method.version == 0
         steps = 0
         if not method.frozen:
-            steps = codetr.first_gradient_steps if first else codetr.gradient_steps
+            steps = codetr.gradient_steps if method.version else codetr.first_gradient_steps
         if steps and not len(memory.segment_ids()):
             self._counters['gradient steps skipped, nothing scored'] += steps
             return

@@ -9,6 +9,7 @@ the learner, one gradient step or `codetr.label_batch` segments in the reward no
 simulator, one episode in the evaluator. While it waits it answers within 50 ms.
 """
 
+import gc
 import hashlib
 import logging
 import resource
@@ -599,3 +600,4 @@ def run_node(
     finally:
         rclpy.try_shutdown()
         signals.ignore()
+        gc.freeze()  # or the interpreter's last collection goes through all of torch: 2 to 7 s

@@ -1,0 +1,240 @@
+"""Learner and reward side of Algorithm 1: what they wait for, what they refuse, what they say."""
+
+import numpy as np
+import pytest
+from builders import commit, run, score, step_rewards, task_spec, tiny, transitions
+from codetr_ros.learners.core import Learner
+from codetr_ros.records import (
+    CompositeReward,
+    Metrics,
+    Policy,
+    RecordError,
+    StepRewards,
+    TrueRewards,
+)
+from codetr_ros.rewards.core import PART_BYTES, Labeller
+
+from codetr_ros import in_process
+
+
+def slices(work, most=10_000):
+    """All that a core yields until it has nothing to do."""
+    found = []
+    for _ in range(most):
+        out = next(work)
+        if out is None:
+            return found
+        found += out
+    raise AssertionError('never idle')
+
+
+class Endless:
+    """One endless episode, handed to a core phase by phase, with its scores and commits."""
+
+    def __init__(self, settings):
+        self.settings = settings
+        self.last = None
+
+    def phase(self, core, phase, scored=True):
+        steps, delay = self.settings.phase_steps, self.settings.delay
+        chunk = transitions(sequence=phase, phase=phase, first_step=phase * steps, steps=steps)
+        if self.last is not None:
+            chunk.observations[0] = self.last.observations[-1]
+        self.last = chunk
+        core.receive(chunk)
+        end = (phase + 1) * steps // delay
+        if scored and CompositeReward in core.subscribes:
+            for n in range(phase * steps // delay, end):
+                core.receive(score(sequence=n, first_step=n * delay, length=delay, value=float(n)))
+        number = np.array([phase], np.int64)
+        last = np.array([end - 1 if scored else -1], np.int64)
+        core.receive(commit(phase=phase, transitions=number, scores=last))
+
+
+def labeller(**changes):
+    settings = tiny(**changes)
+    core = Labeller(run(settings), settings, 'reward', None)
+    core.receive(task_spec())
+    return core, settings
+
+
+def test_labels_come_after_the_warm_up_and_cover_every_scored_segment():
+    core, settings = labeller()
+    episode = Endless(settings)
+    work = core.work()
+    episode.phase(core, 0)
+    assert slices(work) == []
+    episode.phase(core, 1)
+    parts = [r for r in slices(work) if isinstance(r, StepRewards)]
+    assert [p.part for p in parts] == list(range(parts[0].parts))
+    firsts = np.concatenate([p.first_steps for p in parts])
+    assert firsts.tolist() == list(range(0, 400 - 400 % 7, 7))
+    assert all(np.isfinite(p.labels).all() for p in parts)
+
+
+def test_a_frozen_method_sends_each_label_once_and_an_empty_part_where_none_is_new():
+    core, settings = labeller(method='uniform')
+    episode = Endless(settings)
+    work = core.work()
+    for phase in range(2):
+        episode.phase(core, phase)
+    (first,) = [r for r in slices(work) if isinstance(r, StepRewards)]
+    episode.phase(core, 2)
+    (second,) = [r for r in slices(work) if isinstance(r, StepRewards)]
+    assert set(first.first_steps.tolist()).isdisjoint(second.first_steps.tolist())
+    np.testing.assert_allclose(first.labels[:7], 0.0)  # the first segment's score is 0
+    assert (second.part, second.parts, len(second.lengths)) == (0, 1, (600 // 7) - (400 // 7))
+
+
+def test_a_warm_up_without_scores_delays_the_fit_and_freezes_no_scale():
+    core, settings = labeller()
+    episode = Endless(settings)
+    work = core.work()
+    for phase in range(2):
+        episode.phase(core, phase, scored=False)
+    said = slices(work)
+    (part,) = [r for r in said if isinstance(r, StepRewards)]
+    assert (part.parts, len(part.labels)) == (1, 0)
+    (metrics,) = [r for r in said if isinstance(r, Metrics)]
+    values = dict(zip(metrics.names, metrics.values, strict=True))
+    assert values['target_scale'] == 0 and values['gradient_steps'] == 0
+    assert core.report()['counters'] == {'gradient steps skipped, nothing scored': 5}
+
+
+def test_labels_travel_in_parts_well_below_the_shared_memory_segment():
+    settings = tiny(
+        method='uniform', phase_steps=30_000, warmup_steps=30_000, delay=1, memory_steps=100_000
+    )
+    core = Labeller(run(settings), settings, 'reward', None)
+    core.receive(task_spec(horizon=100_000))
+    work = core.work()
+    Endless(settings).phase(core, 0)
+    parts = [r for r in slices(work) if isinstance(r, StepRewards)]
+    assert len(parts) == 3 and sum(len(p.labels) for p in parts) == 30_000
+    assert all(p.labels.nbytes + 3 * p.lengths.nbytes <= PART_BYTES for p in parts)
+
+
+def learner(**changes):
+    settings = tiny(**changes)
+    core = Learner(run(settings), settings, 'learner', None)
+    core.receive(task_spec())
+    return core, settings
+
+
+def test_the_learner_permits_one_phase_in_lock_step_and_two_with_overlap():
+    for overlap, phases in ((False, [0]), (True, [0, 1])):
+        core, _ = learner(overlap=overlap)
+        permitted = slices(core.work())
+        assert [p.phase for p in permitted] == phases
+        assert all(p.random and p.version == -1 and p.weights == b'' for p in permitted)
+
+
+def test_the_learner_waits_for_all_parts_of_the_labels_before_it_learns():
+    core, settings = learner()
+    episode = Endless(settings)
+    work = core.work()
+    slices(work)
+    for phase in range(2):
+        episode.phase(core, phase)
+    permitted = [r for r in slices(work) if isinstance(r, Policy)]
+    assert [p.phase for p in permitted] == [1]
+    core.receive(step_rewards(phase=1, parts=2, part=1))
+    assert slices(work) == [] and core.report()['updates'] == 0
+    core.receive(step_rewards(phase=1, parts=2, part=0, first_steps=np.array([7], np.uint32)))
+    said = slices(work)
+    (permit,) = [r for r in said if isinstance(r, Policy)]
+    assert (permit.phase, permit.version, permit.random) == (2, 1, False)
+    assert core.report()['updates'] == settings.phase_steps
+    (metrics,) = [r for r in said if isinstance(r, Metrics)]
+    assert dict(zip(metrics.names, metrics.values, strict=True))['labelled_steps'] == 10
+
+
+def test_nothing_is_learnt_while_nothing_is_labelled_and_that_is_counted():
+    core, settings = learner()
+    episode = Endless(settings)
+    work = core.work()
+    slices(work)
+    for phase in range(2):
+        episode.phase(core, phase)
+    slices(work)
+    empty = np.empty(0, np.uint32)
+    core.receive(
+        step_rewards(
+            phase=1,
+            source='',
+            episodes=empty,
+            first_steps=empty,
+            lengths=empty,
+            labels=np.empty(0, np.float32),
+        )
+    )
+    slices(work)
+    assert core.report()['counters']['updates skipped, nothing labelled'] == 200
+
+
+@pytest.mark.parametrize(
+    ('wrong', 'said'),
+    [
+        (step_rewards(run_id='other'), "of run 'other'"),
+        (step_rewards(labels=np.ones(4, np.float32)), '4 labels for segments of 5 steps'),
+        (step_rewards(labels=np.full(5, np.nan, np.float32)), r'labels\[0\] is not finite'),
+    ],
+)
+def test_the_learner_refuses_labels_that_cannot_be(wrong, said):
+    core, _ = learner()
+    with pytest.raises(RecordError, match=said):
+        core.receive(wrong)
+
+
+def test_true_rewards_reach_neither_side_unless_the_method_is_the_oracle():
+    for method in ('codetr', 'none', 'uniform'):
+        settings = tiny(method=method)
+        assert TrueRewards not in Labeller(run(settings), settings, 'reward', None).subscribes
+        assert TrueRewards not in Learner(run(settings), settings, 'learner', None).subscribes
+    settings = tiny(method='true')
+    assert TrueRewards in Labeller(run(settings), settings, 'reward', None).subscribes
+
+
+def test_simulators_share_the_steps_of_a_phase():
+    settings = tiny(simulators=3)
+    core = Learner(run(settings), settings, 'learner', None)
+    for source in ('c', 'a', 'b'):
+        core.receive(task_spec(source=source))
+    (permit,) = slices(core.work())
+    assert permit.sources == ('a', 'b', 'c') and permit.steps.tolist() == [67, 67, 66]
+
+
+def test_memory_and_updates_of_a_run_add_up():
+    settings = tiny(method='uniform')
+    seen = []
+    reports = in_process.run(settings, 'run', observe=seen.append)
+    learning = settings.phases - settings.warmup_phases + 1
+    assert reports['learner']['updates'] == learning * settings.phase_steps
+    assert reports['learner']['memory']['steps'] <= settings.memory_steps
+    versions = [r.version for r in seen if isinstance(r, Policy)]
+    assert versions == [-1, *range(settings.phases)]
+    assert [r.steps.sum() for r in seen if isinstance(r, Policy)] == [200] * 6 + [0]
+    networks = {r.network for r in seen if isinstance(r, Policy) and not r.random}
+    assert len(networks) == 1 and '"hidden":[16,16]' in networks.pop()
+
+
+def test_what_raises_while_watching_ends_the_run_with_reports(tmp_path):
+    def observe(record):
+        if isinstance(record, Metrics) and record.phase == 3 and record.role == 'learner':
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        in_process.run(tiny(), 'run', tmp_path, observe)
+    assert (tmp_path / 'nodes' / 'learner-learner.json').is_file()
+    assert list((tmp_path / 'checkpoints').glob('learner-*'))
+
+
+def test_the_oracle_learns_from_the_true_rewards_and_only_it():
+    """The digest of a run with the oracle changes with the true rewards' unit, as it must."""
+    digests = {
+        unit: in_process.run(tiny(method='true', reward_unit=unit), 'run')['learner'][
+            'policy_sha256'
+        ]
+        for unit in ('raw', 'scaled')
+    }
+    assert digests['raw'] != digests['scaled']
