@@ -80,14 +80,18 @@ class CoreNode:
     Args:
         role: one of `records.ROLES`.
         name: node name unless remapped.
-        make_core: makes the core once the run is known.
+        load_core: imports what is slow to import (seconds) and returns what makes the core. Called
+            once the run is known, so that a learner announces its run before, and all import at
+            the same time.
         stop: true once the process is asked to stop.
     """
 
-    def __init__(self, role: str, name: str, make_core: MakeCore, stop: Stop) -> None:
+    def __init__(
+        self, role: str, name: str, load_core: Callable[[], MakeCore], stop: Stop
+    ) -> None:
         self.role = role
         self.stop = stop
-        self._make_core = make_core
+        self._load_core = load_core
         self._instance = secrets.token_hex(8)
         self.link = Link(name)
         self.log = self.link.node.get_logger()
@@ -179,6 +183,11 @@ class CoreNode:
             )
             parameters.check_against_run(node, self.settings, owner)
         parameters.declare_settings(node, self.settings)
+        self._tell()
+        if self.role == 'learner':
+            self.link.advertise(['run'], self.settings)
+            self.link.publish(self.run_spec)
+        make_core = self._load_core()
         if 'torch' in sys.modules:  # the recorder has no torch and needs none
             sys.modules['torch'].set_num_threads(self.settings.threads)
         if (
@@ -189,13 +198,11 @@ class CoreNode:
             self.folder.mkdir(parents=True, exist_ok=True)
             run_folder.write_settings(self.folder, self.settings)
         checkpoints = self.folder / run_folder.CHECKPOINTS if self.folder else None
-        self.core = self._make_core(self.run_spec, self.settings, self.link.name, checkpoints)
+        self.core = make_core(self.run_spec, self.settings, self.link.name, checkpoints)
         self.link.advertise(published_by(self.role), self.settings)
         self.open_topics(self.settings)
         if hasattr(self.core, 'missing'):
             self._fetcher = Fetcher(self.link, self.run_spec.run_id, self._receive)
-        if self.role == 'learner':
-            self.link.publish(self.run_spec)
         self.log.info(
             f'run {self.run_spec.run_id}: task {self.settings.task}, method {self.settings.method}'
         )
@@ -246,7 +253,10 @@ class CoreNode:
             if not missing:
                 return True
             now = time.monotonic()
-            self._doing = f'waits for {"; ".join(missing)}'
+            doing = f'waits for {"; ".join(missing)}'
+            if doing != self._doing:  # somebody has come: the others have their time anew
+                self._doing = doing
+                began = named = now
             if deadline and now - began > deadline:
                 raise NodeError(
                     f'{self.link.full_name} gave up after {deadline:g} s: it {self._doing}. '
@@ -590,11 +600,10 @@ def run_node(
         Exit code: 0 also when stopped by SIGINT or SIGTERM, 1 after an error.
     """
     stop = stop or Stop().install()
-    make_core = load_core()
     arguments = None if argv is None else [name, *argv]
     rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     try:
-        node = node_class(role, name, make_core, stop)
+        node = node_class(role, name, load_core, stop)
         logging.getLogger('codetr_ros').addHandler(_ToRos(node.log))
         return node.run()
     finally:

@@ -8,6 +8,7 @@ committed phases again.
 
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -120,8 +121,10 @@ class LastPhases:
 class RecordNode(CoreNode):
     """The recorder's core, wired to ROS and to a bag."""
 
-    def __init__(self, role: str, name: str, make_core: MakeCore, stop: Stop) -> None:
-        super().__init__(role, name, make_core, stop)
+    def __init__(
+        self, role: str, name: str, load_core: Callable[[], MakeCore], stop: Stop
+    ) -> None:
+        super().__init__(role, name, load_core, stop)
         self._bag: McapWriter | None = None
         self._run_message: bytes | None = None
         self._full: dict[type, str] = {}
