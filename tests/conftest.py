@@ -6,6 +6,8 @@ from collections.abc import Iterator
 
 # before anything imports rclpy
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+# before anything imports torch: on small networks a second thread only waits for the first
+os.environ['OMP_NUM_THREADS'] = '1'
 
 import pytest
 

@@ -196,14 +196,14 @@ def test_a_recorder_commits_a_phase_and_keeps_every_byte_of_it(play, tmp_path):
 
 def test_what_was_published_and_never_came_is_reported_as_lost(play, tmp_path):
     play = play()
-    with process('record', f'folder:={tmp_path}', 'peer_deadline:=3.0') as node:
+    with process('record', f'folder:={tmp_path}', 'peer_deadline:=8.0') as node:
         play.until(lambda: everybody_matched(play), node)
         one_phase(play)
         play.claimed = {'step_rewards': 2}
         play.finished = True
         play.say()
         said = output(node)
-    assert 'gave up after 3 s: waits for the end of nobody and for 2 of step_rewards' in said
+    assert 'gave up after 8 s: waits for the end of nobody and for 2 of step_rewards' in said
     report = run_folder.read_report(run_folder.report_path(tmp_path, 'record', 'record'))
     assert report['lost'] == {'step_rewards': 2}
 
@@ -223,9 +223,10 @@ def test_a_committed_phase_is_sent_again_and_another_refused_with_the_reason(pla
 
         from codetr_ros.ros.fetch import unpack
 
-        records = unpack(ask(run_id='run', phase=0))
-        assert [type(r).__name__ for r in records] == ['Transitions', 'CompositeReward', 'Commit']
-        assert records[0].observations.tobytes() == transitions().observations.tobytes()
+        records = {type(r).__name__: r for r in unpack(ask(run_id='run', phase=0))}
+        assert set(records) == {'Transitions', 'CompositeReward', 'Commit'}
+        again = records['Transitions'].observations
+        assert again.tobytes() == transitions().observations.tobytes()
         assert ask(run_id='run', phase=1).reason == 'phase 1 is not in memory; these are: 0'
         assert "not 'other'" in ask(run_id='other', phase=0).reason
         node.send_signal(signal.SIGTERM)
@@ -291,7 +292,7 @@ def test_a_node_without_a_learner_names_it_and_gives_up(ros_domain):
 
 def test_a_missing_role_is_named_with_what_starts_it(play):
     play = play(roles=('learner', 'sim'))
-    with process('record', 'peer_deadline:=2.0') as node:
+    with process('record', 'peer_deadline:=8.0') as node:
         play.until(lambda: node.poll() is not None)
         said = output(node)
     assert node.returncode == 1
@@ -347,7 +348,7 @@ def test_another_protocol_version_is_refused(play):
     spec = play.spec
     other = RunSpec('other', PROTOCOL_VERSION + 1, 0, spec.settings, spec.settings_hash)
     play.links['learner'].publish(other)
-    with process('record', 'run_id:=other', 'peer_deadline:=4.0') as node:
+    with process('record', 'run_id:=other', 'peer_deadline:=8.0') as node:
         play.until(lambda: node.poll() is not None)
         said = output(node)
     assert node.returncode == 1
@@ -383,7 +384,7 @@ def test_a_second_learner_in_the_namespace_is_refused_naming_both_runs(play):
 
 def test_a_peer_that_stops_before_the_run_is_over_is_named(play):
     play = play()
-    with process('record', 'peer_deadline:=3.0') as node:
+    with process('record', 'peer_deadline:=11.0') as node:
         play.until(lambda: everybody_matched(play), node)
         play.links['sim'].publish(task_spec())
         play.until(lambda: play.presence_of('record'))

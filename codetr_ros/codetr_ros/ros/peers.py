@@ -110,10 +110,15 @@ class Peers:
         """
         missing = []
         for role, count in needed(settings).items():
-            have = len([p for p in self.alive(role) if p.said.settings_hash == settings_hash])
-            have += role == self.role
-            if have < count:
-                of = f' {have + 1} of {count}' if count > 1 else ''
+            there = [p for p in self.alive(role) if not p.said.finished]
+            ready = [p for p in there if p.said.settings_hash == settings_hash]
+            have = len(ready) + (role == self.role)
+            if have >= count:
+                continue
+            of = f' {have + 1} of {count}' if count > 1 else ''
+            if starting := [p.said.node for p in there if p not in ready]:
+                missing.append(f'{role}{of} ({", ".join(starting)} is there, but not ready yet)')
+            else:
                 missing.append(f'{role}{of} (start it with `{COMMANDS[role]}` in this namespace)')
         return missing
 
