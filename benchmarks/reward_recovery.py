@@ -43,7 +43,7 @@ VARIANTS: dict[str, dict[str, object]] = {
     'as shipped': {},
     'label rhat': {'codetr.label': 'rhat'},
     'weights one': {'codetr.weights': 'one'},
-    'head scale inverse': {'codetr.head_scale': 'inverse'},
+    'head scale 1/sqrt(d)': {'codetr.head_scale': 'inverse_sqrt'},
     'initialisation lecun': {'codetr.initialisation': 'lecun'},
     'head scale one': {'codetr.head_scale': 'one'},
     'pair tokens': {'codetr.tokens': 'pair'},

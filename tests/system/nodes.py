@@ -22,7 +22,7 @@ from rclpy.signals import SignalHandlerOptions
 from codetr_ros import launcher, run_folder
 from codetr_ros.config import Settings
 
-PATIENCE = 60.0  # [s] a busy machine starts five nodes in 40
+PATIENCE = 120.0  # [s] a busy machine starts five nodes in 40
 RUN_ID = 'run'
 NAMESPACE = f'/run_{RUN_ID}'
 
