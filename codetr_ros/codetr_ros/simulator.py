@@ -22,6 +22,7 @@ from codetr_ros.records import (
     Transitions,
     TrueRewards,
     describe,
+    metrics,
 )
 from codetr_ros.rollout import Episode, Score, acting_policy, check_policy, uniform_actions
 from codetr_ros.seeding import generator
@@ -252,10 +253,8 @@ class Simulator:
 
     def _metrics(self, phase: int, seconds: float) -> Metrics:
         step = self._settings.steps_after(phase)
-        values = np.array([seconds], np.float64)
-        return Metrics(
-            self._run.run_id, 'sim', self._source, phase, step, ('simulate_seconds',), values
-        )
+        values = {'simulate_seconds': seconds}
+        return metrics(self._run.run_id, 'sim', self._source, phase, step, values)
 
     def close(self) -> None:
         """Close the environment. A simulator keeps no checkpoint."""

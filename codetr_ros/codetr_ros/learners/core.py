@@ -1,9 +1,6 @@
-"""The learner's part of Algorithm 1: permit a phase, take it in, learn from its labels, permit the
-next.
-"""
+"""The learner's part of Algorithm 1: permit, take in, learn from the labels, permit again."""
 
 import time
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,9 +8,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from codetr_ros import checkpoints, records
+from codetr_ros import checkpoints
 from codetr_ros.config import Settings
-from codetr_ros.intake import Intake, check_run
+from codetr_ros.consumer import Consumer
+from codetr_ros.intake import check_run
 from codetr_ros.learners import network
 from codetr_ros.learners.sac import SAC
 from codetr_ros.records import (
@@ -33,7 +31,7 @@ from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.trajectories import Trajectories
 
 
-class Learner:
+class Learner(Consumer):
     """Learns a policy from labelled steps, phase by phase.
 
     Args:
@@ -43,28 +41,14 @@ class Learner:
         folder: where checkpoints go; None keeps none.
     """
 
+    role = 'learner'
     subscribes: tuple[type, ...] = (TaskSpec, Transitions, Commit, StepRewards)
 
     def __init__(self, run: RunSpec, settings: Settings, name: str, folder: Path | None) -> None:
-        self._run = run
-        self._settings = settings
-        self._name = name
-        self._folder = folder
-        self._intake = Intake(run, settings, scores=False)
+        super().__init__(run, settings, name, folder, scores=False)
         self._labels: dict[int, dict[int, StepRewards]] = {}
-        self._memory: Trajectories | None = None
         self._sac: SAC | None = None
-        self._phase = 0  # the next to be learnt from
-        self._saved = -1
         self._updates = 0
-        self._counters: Counter[str] = Counter()
-        self._duplicated: Counter[str] = Counter()
-        self.finished = False
-
-    @property
-    def missing(self) -> int | None:
-        """A committed phase of which something has not arrived."""
-        return self._intake.missing
 
     def receive(self, record: Record) -> None:
         """Hold a record until its phase's turn.
@@ -73,7 +57,7 @@ class Learner:
             RecordError: it must not be taken in; nothing has changed.
         """
         if not isinstance(record, StepRewards):
-            self._intake.receive(record)
+            super().receive(record)
             return
         check_run(record, self._run)
         if len(record.labels) != int(record.lengths.sum()):
@@ -88,68 +72,47 @@ class Learner:
             )
         parts = self._labels.setdefault(record.phase, {})
         if record.phase < self._phase or record.part in parts:
-            self._duplicated[TOPICS[StepRewards]] += 1
+            self.duplicated[TOPICS[StepRewards]] += 1
         else:
             parts[record.part] = record
 
-    def work(self) -> Iterator[list[Record] | None]:
-        """Algorithm 1 as this node sees it; one slice per `next()`."""
-        settings = self._settings
-        while not self._intake.tasks.known:
-            yield None
+    def _begin(self) -> Iterator[list[Record]]:
         spec = self._intake.tasks.first
-        margin = settings.phase_steps + spec.horizon
-        memory = Trajectories(
-            spec.observation_size, spec.action_size, settings.delay, settings.memory_steps, margin
+        self._sac = SAC(
+            spec.observation_size, spec.action_size, self._settings.sac, self._settings.seed
         )
-        sac = SAC(spec.observation_size, spec.action_size, settings.sac, settings.seed)
-        self._memory, self._sac = memory, sac
-        for phase in range(settings.lag):
+        for phase in range(self._settings.lag):
             yield [self._permit(phase, INITIAL_VERSION)]
-        for phase in range(settings.phases):
-            while not self._intake.take(phase, memory):
+
+    def _learn(
+        self, phase: int, memory: Trajectories, learns: bool
+    ) -> Iterator[list[Record] | None]:
+        metrics: dict[str, float] = {}
+        if learns:
+            while not self._labelled(phase):
                 yield None
-            metrics: dict[str, float] = {}
-            if phase >= settings.warmup_phases - 1:
-                while not self._labelled(phase):
-                    yield None
-                for _, part in sorted(self._labels.pop(phase).items()):
-                    self._counters['labels of evicted steps'] += memory.apply(part)
-                for said in self._learn(phase, memory, sac):
-                    metrics |= said
-                    yield []
-            metrics |= {
-                'updates': self._updates,
-                'labelled_steps': memory.labelled_steps,
-                'memory_steps': memory.steps,
-                'memory_bytes': memory.nbytes,
-            }
-            self._phase = phase + 1
-            # the permission first: while it travels, the checkpoint is written
-            yield [
-                self._permit(phase + settings.lag, phase),
-                records.metrics(
-                    self._run.run_id,
-                    'learner',
-                    self._name,
-                    phase,
-                    settings.steps_after(phase),
-                    metrics,
-                ),
-            ]
-            if phase >= settings.warmup_phases - 1:
-                self.close()
+            for _, part in sorted(self._labels.pop(phase).items()):
+                self._counters['labels of evicted steps'] += memory.apply(part)
+            for said in self._update(phase, memory):
+                metrics |= said
                 yield []
-        self.finished = True
-        while True:
-            yield None
+        metrics |= {
+            'updates': self._updates,
+            'labelled_steps': memory.labelled_steps,
+            'memory_steps': memory.steps,
+            'memory_bytes': memory.nbytes,
+        }
+        self._phase = phase + 1
+        # the permission before the checkpoint: while it travels, the checkpoint is written
+        yield [self._permit(phase + self._settings.lag, phase), self._metrics(phase, metrics)]
 
     def _labelled(self, phase: int) -> bool:
         parts = self._labels.get(phase, {})
         return bool(parts) and len(parts) == next(iter(parts.values())).parts
 
-    def _learn(self, phase: int, memory: Trajectories, sac: SAC) -> Iterator[dict[str, float]]:
-        settings = self._settings.sac
+    def _update(self, phase: int, memory: Trajectories) -> Iterator[dict[str, float]]:
+        assert self._sac is not None
+        settings, sac = self._settings.sac, self._sac
         updates = round(self._settings.steps_of(phase) * settings.updates_per_step)
         if not memory.labelled_steps:
             self._counters['updates skipped, nothing labelled'] += updates
@@ -194,40 +157,17 @@ class Learner:
             b'' if random else network.weights_bytes(self._sac.actor),
         )
 
-    def close(self) -> None:
-        """Save a checkpoint of the last finished phase, unless there is one or no folder."""
-        if (
-            self._folder is None
-            or self._sac is None
-            or self._memory is None
-            or self._saved == self._phase - 1
-        ):
-            return
-        tensors = dict(self._sac.state())
+    def _state(self) -> dict[str, torch.Tensor]:
+        assert self._sac is not None
+        assert self._memory is not None
+        state = dict(self._sac.state())
         for source, labels in self._memory.labels().items():
-            tensors[f'labels/{source}'] = torch.from_numpy(labels)
-        meta = {
-            'run_id': self._run.run_id,
-            'settings': self._run.settings,
-            'task': self._intake.tasks.first.task,
-            'observation_size': self._intake.tasks.first.observation_size,
-            'action_size': self._intake.tasks.first.action_size,
-            'phase': self._phase - 1,
-            'updates': self._updates,
-        }
-        checkpoints.save(self._folder, 'learner', self._phase - 1, tensors, meta)
-        self._saved = self._phase - 1
+            state[f'labels/{source}'] = torch.from_numpy(labels)
+        return state
 
     def report(self) -> dict[str, Any]:
-        """Counts and digests for the run's summary."""
-        said: dict[str, Any] = {
-            'duplicated': dict(self._intake.duplicated + self._duplicated),
-            'refused': dict(self._intake.refused),
-            'counters': dict(self._counters),
-            'updates': self._updates,
-        }
+        """Counts and the digest of the policy, for the run's summary."""
+        said = super().report() | {'updates': self._updates}
         if self._sac is not None:
             said['policy_sha256'] = checkpoints.digest(dict(self._sac.actor.state_dict()))
-        if self._memory is not None:
-            said['memory'] = self._memory.report()
         return said

@@ -1,6 +1,4 @@
-"""The reward node's part of Algorithm 1: take a phase in, fit the reward model, label, say what
-changed.
-"""
+"""The reward side's part of Algorithm 1: take a phase in, fit, label, say what changed."""
 
 import time
 from collections import Counter
@@ -9,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
-from codetr_ros import checkpoints, records, rewards
+from codetr_ros import checkpoints, rewards
 from codetr_ros.config import Settings
-from codetr_ros.intake import Intake
+from codetr_ros.consumer import Consumer
 from codetr_ros.records import (
     F32,
     I64,
@@ -33,7 +32,7 @@ PART_BYTES = 200_000
 """Upper bound of a part's arrays: well inside the 512 KB segment of Fast DDS' shared memory."""
 
 
-class Labeller:
+class Labeller(Consumer):
     """Infers step rewards from composite rewards, phase by phase.
 
     Args:
@@ -43,88 +42,49 @@ class Labeller:
         folder: where checkpoints go; None keeps none.
     """
 
+    role = 'reward'
     subscribes: tuple[type, ...] = (TaskSpec, Transitions, CompositeReward, Commit)
 
     def __init__(self, run: RunSpec, settings: Settings, name: str, folder: Path | None) -> None:
-        self._run = run
-        self._settings = settings
-        self._name = name
-        self._folder = folder
-        self._oracle = settings.method == 'true'
-        if self._oracle:
+        oracle = settings.method == 'true'
+        if oracle:
             self.subscribes = (*self.subscribes, TrueRewards)
-        self._intake = Intake(run, settings, scores=True, true_rewards=self._oracle)
+        super().__init__(run, settings, name, folder, scores=True, true_rewards=oracle)
         self._method: rewards.RewardMethod | None = None
-        self._memory: Trajectories | None = None
         self._labelled_version = -1
         self._labelled = np.empty(0, np.int64)  # ids that have their first label
-        self._phase = 0
-        self._saved = -1
-        self._counters: Counter[str] = Counter()
-        self.finished = False
 
-    @property
-    def missing(self) -> int | None:
-        """A committed phase of which something has not arrived."""
-        return self._intake.missing
-
-    def receive(self, record: Record) -> None:
-        """Hold a record until its phase's turn.
-
-        Raises:
-            RecordError: it must not be taken in; nothing has changed.
-        """
-        self._intake.receive(record)
-
-    def work(self) -> Iterator[list[Record] | None]:
-        """Algorithm 1 as this node sees it; one slice per `next()`."""
-        settings = self._settings
-        while not self._intake.tasks.known:
-            yield None
+    def _begin(self) -> Iterator[list[Record]]:
         spec = self._intake.tasks.first
-        memory = Trajectories(
-            spec.observation_size,
-            spec.action_size,
-            settings.delay,
-            settings.memory_steps,
-            settings.phase_steps + spec.horizon,
-            self._oracle,
-        )
-        method = rewards.make(settings, spec.observation_size, spec.action_size)
-        self._memory, self._method = memory, method
-        for phase in range(settings.phases):
-            while not self._intake.take(phase, memory):
-                yield None
-            if phase < settings.warmup_phases - 1:
-                self._phase = phase + 1
-                continue
-            if method.target_scale == 0 and len(memory.segment_ids()):
-                method.prepare(memory)  # once; later where nothing was scored in the warm-up
-            metrics: dict[str, float] = {}
-            for said in self._fit(phase, memory, method):
-                metrics |= said
-                yield []
-            began = time.perf_counter()
-            parts: list[StepRewards] = []
-            for batch in self._label(phase, memory, method):
-                parts += batch
-                yield []
-            metrics |= {
-                'target_scale': method.target_scale,
-                'gradient_steps': method.version,
-                'label_seconds': time.perf_counter() - began,
-            }
+        self._method = rewards.make(self._settings, spec.observation_size, spec.action_size)
+        yield []
+
+    def _learn(
+        self, phase: int, memory: Trajectories, learns: bool
+    ) -> Iterator[list[Record] | None]:
+        method = self._method
+        assert method is not None
+        if not learns:
             self._phase = phase + 1
-            step = settings.steps_after(phase)
-            yield [
-                *self._numbered(phase, method.version, parts),
-                records.metrics(self._run.run_id, 'reward', self._name, phase, step, metrics),
-            ]
-            self.close()
+            return
+        if method.target_scale == 0 and len(memory.segment_ids()):
+            method.prepare(memory)  # once; later where nothing was scored in the warm-up
+        metrics: dict[str, float] = {}
+        for said in self._fit(phase, memory, method):
+            metrics |= said
             yield []
-        self.finished = True
-        while True:
-            yield None
+        began = time.perf_counter()
+        parts: list[StepRewards] = []
+        for batch in self._label(phase, memory, method):
+            parts += batch
+            yield []
+        metrics |= {
+            'target_scale': method.target_scale,
+            'gradient_steps': method.version,
+            'label_seconds': time.perf_counter() - began,
+        }
+        self._phase = phase + 1
+        yield [*self._numbered(phase, method.version, parts), self._metrics(phase, metrics)]
 
     def _fit(
         self, phase: int, memory: Trajectories, method: rewards.RewardMethod
@@ -237,36 +197,14 @@ class Labeller:
             for i, pieces in enumerate(parts)
         ]
 
-    def close(self) -> None:
-        """Save a checkpoint of the last finished phase, unless there is one or no folder."""
-        done = self._phase - 1
-        if self._folder is None or self._method is None or self._saved == done:
-            return
-        if done < self._settings.warmup_phases - 1:
-            return
-        spec = self._intake.tasks.first
-        meta = {
-            'run_id': self._run.run_id,
-            'settings': self._run.settings,
-            'task': spec.task,
-            'observation_size': spec.observation_size,
-            'action_size': spec.action_size,
-            'phase': done,
-            'gradient_steps': self._method.version,
-        }
-        checkpoints.save(self._folder, 'reward', done, self._method.state(), meta)
-        self._saved = done
+    def _state(self) -> dict[str, torch.Tensor]:
+        assert self._method is not None
+        return self._method.state()
 
     def report(self) -> dict[str, Any]:
-        """Counts and digests for the run's summary."""
-        said: dict[str, Any] = {
-            'duplicated': dict(self._intake.duplicated),
-            'refused': dict(self._intake.refused),
-            'counters': dict(self._counters),
-        }
+        """Counts and the digest of the reward model, for the run's summary."""
+        said = super().report()
         if self._method is not None:
             said['gradient_steps'] = self._method.version
             said['reward_model_sha256'] = checkpoints.digest(self._method.state())
-        if self._memory is not None:
-            said['memory'] = self._memory.report()
         return said
