@@ -320,7 +320,7 @@ def test_silence_is_broken_by_news_but_not_by_presence() -> None:
     now = [0.0]
     silence = Silence(lambda: now[0])
     now[0] = 30
-    silence.receive(Presence('r', 'sim', 'sim', 'i', '', False, (), ()))  # type: ignore[arg-type]
+    silence.receive(Presence('r', 'sim', 'sim', 'i', '', False, (), (), 0))  # type: ignore[arg-type]
     assert silence.seconds == 30
     silence.receive(Commit('r', 0, (), (), (), (), ()))  # type: ignore[arg-type]
     assert silence.seconds == 0

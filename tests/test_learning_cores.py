@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from builders import commit, run, score, step_rewards, task_spec, tiny, transitions
 from codetr_ros.learners.core import Learner
+from codetr_ros.learners.sac import SacError
 from codetr_ros.records import (
     CompositeReward,
     Metrics,
@@ -177,6 +178,7 @@ def test_nothing_is_learnt_while_nothing_is_labelled_and_that_is_counted():
     [
         (step_rewards(run_id='other'), "of run 'other'"),
         (step_rewards(labels=np.ones(4, np.float32)), '4 labels for segments of 5 steps'),
+        (step_rewards(part=2, parts=2), 'part 2 of 2'),
         (step_rewards(labels=np.full(5, np.nan, np.float32)), r'labels\[0\] is not finite'),
     ],
 )
@@ -238,3 +240,34 @@ def test_the_oracle_learns_from_the_true_rewards_and_only_it():
         for unit in ('raw', 'scaled')
     }
     assert digests['raw'] != digests['scaled']
+
+
+def test_a_policy_that_has_diverged_ends_the_run_and_says_what_to_do():
+    """Weights that are not finite would be refused by every simulator, which would then wait."""
+    core, settings = learner()
+    episode = Endless(settings)
+    work = core.work()
+    slices(work)
+    for phase in range(2):
+        episode.phase(core, phase)
+        slices(work)
+    core.receive(step_rewards(phase=1, labels=np.full(5, 3e38, np.float32)))
+    with pytest.raises(SacError, match='not finite after phase 1 .*Lower sac.actor_learning_rate'):
+        slices(work)
+
+
+def test_no_first_gradient_steps_still_means_gradient_steps_later():
+    settings = tiny(codetr__first_gradient_steps=0)
+    reports = in_process.run(settings, 'run')
+    later = settings.phases - settings.warmup_phases
+    assert reports['reward']['gradient_steps'] == later * settings.codetr.gradient_steps
+
+
+def test_window_labelling_gives_every_step_a_label_in_the_place_it_belongs():
+    settings = tiny(codetr__labelling='window', codetr__window=5, codetr__label_batch=16)
+    seen = []
+    in_process.run(settings, 'run', observe=seen.append)
+    for record in seen:
+        if isinstance(record, StepRewards):
+            assert len(record.labels) == record.lengths.sum() and np.isfinite(record.labels).all()
+    assert sum(isinstance(record, StepRewards) for record in seen) >= 5

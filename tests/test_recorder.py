@@ -75,7 +75,7 @@ def test_what_arrives_twice_is_counted_once():
 
 
 def test_every_simulator_must_have_ended_its_share():
-    r = recorder(simulators=2)
+    r = recorder(simulators=2, phase_steps=10)
     r.receive(task_spec(source='two'))
     work = r.work()
     r.receive(policy(sources=('sim', 'two'), steps=np.array([5, 5], np.uint32)))
@@ -89,6 +89,7 @@ def test_every_simulator_must_have_ended_its_share():
 def test_steps_of_another_run_or_source_or_with_nan_are_refused():
     r = recorder()
     for wrong, said in (
+        (policy(steps=np.array([7], np.uint32)), 'permits 7 steps; .* phase 0 has 200 steps'),
         (transitions(run_id='other'), "of run 'other'"),
         (transitions(source='stranger'), 'no simulator of this run'),
         (

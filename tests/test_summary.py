@@ -266,8 +266,23 @@ def test_a_summary_on_disk_is_what_was_built(tmp_path: Path) -> None:
     assert (tmp_path / 'metrics.csv').read_text() == 'step\n0\n'
 
 
-def presence(node: str) -> Presence:
-    return Presence('r', 'sim', node, 'i', '', False, ('task',), np.array([1], np.uint64))
+def presence(node: str, missed: int = 0) -> Presence:
+    published = np.array([1], np.uint64)
+    return Presence('r', 'sim', node, 'i', '', False, ('task',), published, missed)
+
+
+def test_progress_shows_what_nodes_say_that_they_lack() -> None:
+    clock, stream = Clock(), io.StringIO()
+    progress = Progress(SETTINGS, stream, live=False, clock=clock)
+    progress.receive(presence('/r/sim'))
+    progress.receive(presence('/r/reward', missed=2))
+    progress.receive(presence('/r/learner', missed=3))
+    progress.receive(presence('/r/reward'))  # it has come after all
+    clock.now += 10
+    progress.tick()
+
+    assert progress.lost == 3
+    assert 'lost messages 3' in stream.getvalue()
 
 
 def test_progress_without_a_terminal_says_a_line_for_each_evaluation_and_few_others() -> None:

@@ -186,7 +186,10 @@ class Settings(Group):
     seed: int = Field(0, ge=0, le=2**31 - 1, description='seed of everything random')
     phase_steps: int = Field(1000, ge=1, le=10**6, description='environment steps of a phase')
     warmup_steps: int = Field(
-        10_000, ge=1, le=10**8, description='uniformly random steps at the start'
+        10_000,
+        ge=1,
+        le=10**8,
+        description='uniformly random steps at the start, rounded up to whole phases',
     )
     overlap: bool = Field(
         False,
@@ -236,8 +239,8 @@ class Settings(Group):
 
     @property
     def warmup_phases(self) -> int:
-        """Phases under the random policy, at least one."""
-        return max(1, min(self.phases, round(self.warmup_steps / self.phase_steps)))
+        """Phases under the random policy: a phase begun is ended so."""
+        return min(self.phases, -(-self.warmup_steps // self.phase_steps))
 
     @property
     def lag(self) -> int:

@@ -52,6 +52,11 @@ class Consumer(ABC):
         self.finished = False
 
     @property
+    def refused(self) -> 'Counter[str]':
+        """Records left out of a committed phase, by topic."""
+        return self._intake.refused
+
+    @property
     def missing(self) -> int | None:
         """A committed phase of which something has not arrived."""
         return self._intake.missing
@@ -132,7 +137,7 @@ class Consumer(ABC):
         """Counts for the run's summary."""
         said: dict[str, Any] = {
             'duplicated': dict(self.duplicated),
-            'refused': dict(self._intake.refused),
+            'refused': dict(self.refused),
             'counters': dict(self._counters),
         }
         if self._memory is not None:

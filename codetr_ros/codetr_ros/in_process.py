@@ -56,6 +56,7 @@ def run(
     run_id: str,
     folder: Path | None = None,
     observe: Callable[[Record], None] = lambda record: None,
+    tick: Callable[[], None] = lambda: None,
 ) -> dict[str, dict[str, Any]]:
     """Run Algorithm 1 to its end.
 
@@ -64,6 +65,7 @@ def run(
         run_id: its name.
         folder: where checkpoints and reports go; None keeps none.
         observe: is handed every record, in order. What it raises ends the run, after a checkpoint.
+        tick: is called after every slice of work; the same holds for what it raises.
 
     Returns:
         A report for each part of the run, as the nodes write them.
@@ -94,6 +96,7 @@ def run(
                 began = time.perf_counter()
                 records = next(work)
                 seconds[name] += time.perf_counter() - began
+                tick()
                 if records is None:
                     continue
                 idle = False

@@ -186,7 +186,11 @@ class Intake:
             self.tasks.receive(record)
             waiting, self._unchecked = self._unchecked, []
             for chunk in waiting:
-                self.receive(chunk)
+                try:
+                    self.receive(chunk)
+                except RecordError as error:  # its fault, not that of the announcement
+                    self.refused[TOPICS[Transitions]] += 1
+                    _log.error('%s', error)
         elif isinstance(record, Transitions):
             self._receive_transitions(record)
         elif isinstance(record, CompositeReward):
@@ -223,6 +227,12 @@ class Intake:
         key: tuple[str, int],
         taken: 'Counter[str]',
     ) -> None:
+        ahead = (self._settings.lag + 1) * self._settings.phase_steps
+        if key[1] >= taken[key[0]] + ahead:
+            raise RecordError(
+                f'{describe(record)} is out of sequence: the permitted phases hold fewer than '
+                f'{ahead} records, and {taken[key[0]]} is the next of {key[0]!r} to be taken in'
+            )
         if key in held or key[1] < taken[key[0]]:
             self.duplicated[TOPICS[type(record)]] += 1
         else:

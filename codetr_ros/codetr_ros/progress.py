@@ -105,9 +105,7 @@ class Progress:
             self._take(record)
         elif isinstance(record, Presence):
             self._present[record.node] = record.role
-            # Older recordings of presence have no such field.
-            missed: Any = getattr(record, 'missed', ())
-            self._missed[record.node] = int(np.sum(missed))
+            self._missed[record.node] = record.missed
         self.tick()
 
     def tick(self) -> None:

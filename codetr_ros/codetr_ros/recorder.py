@@ -65,6 +65,12 @@ class Recorder:
         if isinstance(record, TaskSpec):
             self._tasks.receive(record)
         elif isinstance(record, Policy):
+            due, given = self._settings.steps_of(record.phase), int(record.steps.sum())
+            if record.phase < self.phase or given != due:
+                raise RecordError(
+                    f'{describe(record)} permits {given} steps; phase {self.phase} is the next to '
+                    f'be committed and phase {record.phase} has {due} steps: stop the second learner'
+                )
             steps = dict(zip(record.sources, record.steps.tolist(), strict=True))
             self._permitted[record.phase] = {source: n for source, n in steps.items() if n}
         elif isinstance(record, Transitions):

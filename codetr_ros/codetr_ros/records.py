@@ -49,17 +49,19 @@ class Presence:
     """A node says that it is there: on start, once a second, and a last time when it has finished.
 
     `published` counts the records it has published so far on each of `topics`, so that whoever
-    listens can say what is missing.
+    listens can say what is missing; `missed` is what this node found missing so itself: records
+    that it was told were published on topics it reads and that have not reached it after a while.
     """
 
     run_id: str
     role: str  # one of ROLES
-    node: str  # fully qualified node name; the source's name where role is 'sim'
+    node: str  # fully qualified node name; its last part is the source's name where role is 'sim'
     instance_id: str  # another one after each start of the process
     settings_hash: str  # empty while the node still waits for the run
     finished: bool
     topics: tuple[str, ...]
     published: U64  # (len(topics),)
+    missed: int  # lost on the way to this node, all topics together
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -73,7 +75,7 @@ class TaskSpec:
     observation_size: int
     action_size: int
     horizon: int  # steps after which an episode is truncated
-    control_period: float  # seconds of simulated time that a step takes
+    control_period: float  # seconds of simulated time that a step takes; 0 where unknown
     r_max: float  # the largest reward of one step, for score normalisation
 
 
@@ -175,7 +177,8 @@ class EpisodeResult:
     purpose: (
         str  # 'training', 'evaluation' or 'random' (evaluation of the uniformly random policy)
     )
-    # training steps that the policy has learnt from (evaluation), or taken so far (training)
+    # training steps that the policy has learnt from (evaluation), or that the run has taken if all
+    # its sources are as far in the phase as this one (training)
     step: int
     version: int  # policy version
     episode: int

@@ -156,7 +156,8 @@ class Trajectories:
         observation_size: O.
         action_size: A.
         delay: steps n of a segment.
-        capacity: steps after which `evict` drops the oldest episodes.
+        capacity: steps, of all sources together, after which `evict` drops the oldest episodes.
+            Each source has rows for as many, which take memory when they are first used.
         margin: steps that may be held beyond the capacity before `evict` is called: a phase and an
             episode.
         true_rewards: keep the environment's own rewards too, for the oracle.

@@ -1,7 +1,9 @@
 """The nodes of a run in one namespace: `ros2 launch codetr_ros train.launch.py config:=quick`.
 
 They start in any order and wait for each other; the launch ends when the recorder has, which is
-last.
+last. There is one simulator: a run with the setting `simulators` above 1 waits until the others
+are started by hand, each with a name of its own, `ros2 run sim_node sim --ros-args -r
+__ns:=/codetr -r __node:=sim_2`.
 """
 
 from launch import LaunchDescription

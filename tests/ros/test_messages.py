@@ -29,7 +29,9 @@ ODD = np.array(
 
 EXAMPLES = {
     RunSpec: RunSpec('r', 1, 7, '{"ä": 1}', 'ab'),
-    Presence: Presence('r', 'sim', '/r/s', 'x', '', True, ('a', 'b'), np.array([1, 2**63], 'u8')),
+    Presence: Presence(
+        'r', 'sim', '/r/s', 'x', '', True, ('a', 'b'), np.array([1, 2**63], 'u8'), 2**40
+    ),
     TaskSpec: TaskSpec('r', 1, 'sim', 'Ant-v4', 27, 8, 1000, 0.05, 0.1),
     Policy: Policy('r', 3, -1, ('sim',), np.array([5], np.uint32), False, '{}', bytes(range(9))),
     Transitions: transitions(sequence=2**40),

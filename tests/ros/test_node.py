@@ -86,7 +86,7 @@ class Play:
                 Presence(
                     self.spec.run_id, role, link.full_name, f'{role} of the test',
                     self.spec.settings_hash,
-                    self.finished, topics, np.array(counts, np.uint64),
+                    self.finished, topics, np.array(counts, np.uint64), 0,
                 )
             )  # fmt: skip
 

@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 from builders import tiny
-from codetr_ros.config import Settings, load
 from rosbags.highlevel import AnyReader
 from system.runs import train
 
-LEARNT_FROM = ('transitions', 'composite_rewards', 'step_rewards', 'commits', 'policy')
+from codetr_ros.config import Settings, load
 
 
 def read(bag: Path) -> dict[str, list[Any]]:
@@ -38,6 +37,9 @@ def check(summary: dict[str, Any], settings: Settings) -> dict[str, list[Any]]:
         'transitions',
         'composite_rewards',
         'true_rewards',
+        'step_rewards',
+        'policy',
+        'metrics',
         'episodes',
         'commits',
         'task',
@@ -76,15 +78,28 @@ def check_steps(bag: dict[str, list[Any]], settings: Settings) -> None:
 
 
 def check_labels(bag: dict[str, list[Any]], settings: Settings) -> None:
-    """Each scored segment's first label is there, once; with `all`, what was published is."""
-    segments = {(m.episode, m.first_step, m.length) for m in bag['composite_rewards']}
-    first = Counter()
+    """Each scored segment has its first label, of the phase in which it ended, or of the last of
+    the warm-up.
+    """
+    ends = {
+        (m.episode, m.first_step + step): m.phase
+        for m in bag['transitions']
+        for step in range(m.steps)
+    }
+    due = {
+        (m.episode, m.first_step, m.length): max(
+            ends[m.episode, m.first_step + m.length - 1], settings.warmup_phases - 1
+        )
+        for m in bag['composite_rewards']
+    }
+    first: dict[tuple[int, int, int], int] = {}
     for m in bag['step_rewards']:
         assert m.lengths.sum() == len(m.labels) and np.isfinite(m.labels).all()
-        first.update(
-            zip(m.episodes.tolist(), m.first_steps.tolist(), m.lengths.tolist(), strict=True)
-        )
-    assert set(first) == segments
+        for segment in zip(
+            m.episodes.tolist(), m.first_steps.tolist(), m.lengths.tolist(), strict=True
+        ):
+            first.setdefault(segment, m.phase)
+    assert first == due
 
 
 def test_the_default_run_loses_nothing_and_its_bag_holds_everything(tmp_path):

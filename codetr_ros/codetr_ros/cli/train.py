@@ -150,13 +150,15 @@ def _in_process(
     def observe(record: Record) -> None:
         summary.receive(record)
         progress.receive(record)
+
+    def tick() -> None:
         if interrupts.count:
             raise KeyboardInterrupt
 
     # A slice may be long: whoever asks twice does not wait for its end.
     interrupts.raising = True
     try:
-        return Outcome(in_process.run(settings, run_id, folder, observe))
+        return Outcome(in_process.run(settings, run_id, folder, observe, tick))
     except KeyboardInterrupt:
         progress.say('stopped')
         return Outcome(run_folder.read_reports(folder), interrupted=True)

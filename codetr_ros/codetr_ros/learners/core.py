@@ -13,7 +13,7 @@ from codetr_ros.config import Settings
 from codetr_ros.consumer import Consumer
 from codetr_ros.intake import check_run
 from codetr_ros.learners import network
-from codetr_ros.learners.sac import SAC
+from codetr_ros.learners.sac import SAC, SacError
 from codetr_ros.records import (
     INITIAL_VERSION,
     TOPICS,
@@ -70,11 +70,17 @@ class Learner(Consumer):
                 f'{describe(record)}: labels[{int(np.argmin(np.isfinite(record.labels)))}] is not '
                 'finite'
             )
-        parts = self._labels.setdefault(record.phase, {})
+        parts = self._labels.get(record.phase, {})
+        others = next((part.parts for part in parts.values()), record.parts)
+        if record.part >= record.parts or record.parts != others:
+            raise RecordError(
+                f'{describe(record)}: part {record.part} of {record.parts}, where others of the '
+                f'phase are of {others}: two reward nodes? Stop one of them'
+            )
         if record.phase < self._phase or record.part in parts:
             self.duplicated[TOPICS[StepRewards]] += 1
         else:
-            parts[record.part] = record
+            self._labels.setdefault(record.phase, {})[record.part] = record
 
     def _begin(self) -> Iterator[list[Record]]:
         spec = self._intake.tasks.first
@@ -133,6 +139,12 @@ class Learner(Consumer):
             self._updates += burst
             yield {}
         means = {name: float(total) / updates for name, total in totals.items()}
+        if not all(bool(weight.isfinite().all()) for weight in sac.actor.parameters()):
+            raise SacError(
+                f'the policy is not finite after phase {phase} ({means}): training has diverged. '
+                'Lower sac.actor_learning_rate and sac.critic_learning_rate, or set '
+                'target_scale=rms and reward_unit=scaled'
+            )
         yield means | {'update_seconds': time.perf_counter() - began}
 
     def _permit(self, phase: int, version: int) -> Policy:

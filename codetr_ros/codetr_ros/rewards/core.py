@@ -51,6 +51,7 @@ class Labeller(Consumer):
             self.subscribes = (*self.subscribes, TrueRewards)
         super().__init__(run, settings, name, folder, scores=True, true_rewards=oracle)
         self._method: rewards.RewardMethod | None = None
+        self._fitted = False
         self._labelled_version = -1
         self._labelled = np.empty(0, np.int64)  # ids that have their first label
 
@@ -92,10 +93,11 @@ class Labeller(Consumer):
         codetr = self._settings.codetr
         steps = 0
         if not method.frozen:
-            steps = codetr.gradient_steps if method.version else codetr.first_gradient_steps
+            steps = codetr.gradient_steps if self._fitted else codetr.first_gradient_steps
         if steps and not len(memory.segment_ids()):
             self._counters['gradient steps skipped, nothing scored'] += steps
             return
+        self._fitted = True
         began = time.perf_counter()
         sums: Counter[str] = Counter()
         for i in range(steps):
@@ -111,23 +113,36 @@ class Labeller(Consumer):
     def _label(
         self, phase: int, memory: Trajectories, method: rewards.RewardMethod
     ) -> Iterator[list[StepRewards]]:
+        """Label what is new or has changed; a slice is one forward pass."""
         ids = memory.segment_ids()
         fresh = np.setdiff1d(ids, self._labelled, assume_unique=True)
         todo = fresh if method.frozen or method.version == self._labelled_version else ids
         for i in range(0, len(todo), self._settings.codetr.label_batch):
             some = todo[i : i + self._settings.codetr.label_batch]
-            labels = self._labels(memory, method, some)
-            yield self._records(phase, memory, some, labels, method.version)
+            passes = []
+            for labels in self._passes(memory, method, some):
+                passes.append(labels)
+                yield []
+            joined = np.concatenate(passes)
+            if not np.isfinite(joined).all():
+                raise rewards.RewardModelError(
+                    f'labels are not finite after {method.version} gradient steps: training has '
+                    'diverged. Lower codetr.learning_rate, or set target_scale=rms'
+                )
+            yield self._records(phase, memory, some, joined, method.version)
         self._labelled, self._labelled_version = ids, method.version
 
-    def _labels(self, memory: Trajectories, method: rewards.RewardMethod, ids: I64) -> F32:
-        """Labels of segments, one after the other: (sum of lengths,)."""
+    def _passes(
+        self, memory: Trajectories, method: rewards.RewardMethod, ids: I64
+    ) -> Iterator[F32]:
+        """Labels of segments one after the other, (sum of lengths,) in all, pass by pass."""
         codetr = self._settings.codetr
         if codetr.labelling == 'window' and not method.frozen:
-            batches = memory.windows(ids, codetr.window, codetr.label_batch)
-            return np.concatenate([method.label_windows(batch) for batch in batches])
-        batch = memory.segment_batch(ids, method.context)
-        return method.label(batch)[segment_steps(batch)]
+            for batch in memory.windows(ids, codetr.window, codetr.label_batch):
+                yield method.label_windows(batch)
+        else:
+            batch = memory.segment_batch(ids, method.context)
+            yield method.label(batch)[segment_steps(batch)]
 
     def _records(
         self, phase: int, memory: Trajectories, ids: I64, labels: F32, version: int

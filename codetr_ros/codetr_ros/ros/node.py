@@ -420,6 +420,7 @@ class CoreNode:
         self._told_at = time.monotonic()
         topics = tuple(t for t in published_by(self.role) if t in self.link.published)
         spec = self.run_spec
+        lost = self.lost()
         self.link.publish(
             Presence(
                 spec.run_id if spec else '',
@@ -430,9 +431,9 @@ class CoreNode:
                 finished,
                 topics,
                 np.array([self.link.published[t] for t in topics], np.uint64),
+                sum(lost.values()),
             )
         )
-        lost = self.lost()
         counters = {
             'published': dict(self.link.published),
             'received': dict(self.received),
