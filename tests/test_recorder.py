@@ -89,7 +89,7 @@ def test_every_simulator_must_have_ended_its_share():
 def test_steps_of_another_run_or_source_or_with_nan_are_refused():
     r = recorder()
     for wrong, said in (
-        (policy(steps=np.array([7], np.uint32)), 'permits 7 steps; .* phase 0 has 200 steps'),
+        (policy(steps=np.array([7], np.uint32)), 'permits 7 steps; .* phase 0 has 200'),
         (transitions(run_id='other'), "of run 'other'"),
         (transitions(source='stranger'), 'no simulator of this run'),
         (

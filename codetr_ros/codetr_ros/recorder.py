@@ -69,7 +69,7 @@ class Recorder:
             if record.phase < self.phase or given != due:
                 raise RecordError(
                     f'{describe(record)} permits {given} steps; phase {self.phase} is the next to '
-                    f'be committed and phase {record.phase} has {due} steps: stop the second learner'
+                    f'be committed, phase {record.phase} has {due}: stop the second learner'
                 )
             steps = dict(zip(record.sources, record.steps.tolist(), strict=True))
             self._permitted[record.phase] = {source: n for source, n in steps.items() if n}

@@ -5,9 +5,8 @@ Both the reward side and the learner keep one. Each observation is stored once; 
 wrong record is refused and changes nothing.
 """
 
-from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +21,10 @@ from codetr_ros.records import (
     Transitions,
     TrueRewards,
 )
+from codetr_ros.source_ring import Episode, SourceRing
 
-_SOURCE_SHIFT = (
-    40  # a segment id is (source index << 40) | number of the segment within its source
-)
+_SOURCE_SHIFT = 40
+"""A segment id is (source index << 40) | number of the segment within its source."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -49,104 +48,6 @@ class SegmentBatch:
     context: I64  # (B,) leading steps that precede the segment
     values: F64  # (B,) the segment's composite reward; NaN for windows that only serve labelling
     true_rewards: F32 | None = None  # (B, L), where the memory holds them: the oracle only
-
-
-@dataclass(slots=True)
-class _Episode:
-    number: int
-    start: int  # row of its first step
-    order: int  # episodes leave the memory in the order in which they came
-    steps: int = 0
-    ended: bool = False
-    scored: dict[int, int] = field(default_factory=dict)  # first step -> segment number
-
-
-class _Source:
-    """The steps of one source, in a ring: row r lies in slot r % capacity, rows only grow."""
-
-    def __init__(
-        self, name: str, observation_size: int, action_size: int, capacity: int, true_rewards: bool
-    ) -> None:
-        self.name = name
-        self.capacity = capacity
-        # np.empty takes memory page by page as steps arrive, not at once
-        self.observations = np.empty((capacity, observation_size), np.float32)
-        self.actions = np.empty((capacity, action_size), np.float32)
-        self.labels = np.empty(capacity, np.float32)  # NaN: not labelled
-        self.versions = np.empty(capacity, np.uint32)
-        self.terminated = np.empty(capacity, np.bool_)
-        self.last = np.empty(
-            capacity, np.bool_
-        )  # last step so far of its episode: next observation is in `finals`
-        self.true_rewards = np.empty(capacity, np.float32) if true_rewards else None
-        self.finals: dict[int, F32] = {}
-        self.start = 0
-        self.end = 0
-        self.episodes: deque[_Episode] = deque()
-        self.newest: _Episode | None = (
-            None  # also where it has been evicted: the next steps follow on it
-        )
-        self.by_number: dict[int, _Episode] = {}
-        # segments, grown by doubling; number n lies at n - first_segment
-        self.first_segment = 0
-        self.segments = 0
-        self.segment_rows = np.empty(64, np.int64)
-        self.segment_lengths = np.empty(64, np.int64)
-        self.segment_offsets = np.empty(64, np.int64)  # first step within the episode
-        self.segment_episodes = np.empty(64, np.int64)
-        self.segment_values = np.empty(64, np.float64)
-        self.alive = np.empty(64, np.bool_)
-
-    @property
-    def steps(self) -> int:
-        return self.end - self.start
-
-    @property
-    def arrays(self) -> tuple[NDArray[np.generic], ...]:
-        rows: tuple[NDArray[np.generic], ...] = (
-            self.observations,
-            self.actions,
-            self.labels,
-            self.versions,
-            self.terminated,
-            self.last,
-        )
-        return rows if self.true_rewards is None else (*rows, self.true_rewards)
-
-    def add_segment(self, row: int, length: int, offset: int, episode: int, value: float) -> int:
-        at = self.segments
-        for name in ('rows', 'lengths', 'offsets', 'episodes', 'values'):
-            self._grow(f'segment_{name}', at)
-        self._grow('alive', at)
-        self.segment_rows[at], self.segment_lengths[at], self.segment_offsets[at] = (
-            row,
-            length,
-            offset,
-        )
-        self.segment_episodes[at], self.segment_values[at], self.alive[at] = episode, value, True
-        self.segments += 1
-        return self.first_segment + at
-
-    def _grow(self, name: str, needed: int) -> None:
-        array = getattr(self, name)
-        if needed >= len(array):
-            setattr(self, name, np.concatenate([array, np.empty_like(array)]))
-
-    def drop_segments(self, episode: _Episode) -> None:
-        for number in episode.scored.values():
-            self.alive[number - self.first_segment] = False
-        dead = (
-            int(np.argmax(self.alive[: self.segments]))
-            if self.alive[: self.segments].any()
-            else self.segments
-        )
-        if dead > self.segments // 2 and dead >= 64:
-            for name in ('rows', 'lengths', 'offsets', 'episodes', 'values'):
-                array = getattr(self, f'segment_{name}')
-                array[: self.segments - dead] = array[dead : self.segments].copy()
-            self.alive[: self.segments - dead] = self.alive[dead : self.segments].copy()
-            self.first_segment += dead
-            self.segments -= dead
 
 
 class Trajectories:
@@ -179,9 +80,9 @@ class Trajectories:
         self.evicted = 0
         self._margin = margin
         self._true_rewards = true_rewards
-        self._sources: dict[str, _Source] = {}
+        self._sources: dict[str, SourceRing] = {}
         self._order = 0
-        self._sampleable: tuple[NDArray[np.int64], list[_Source]] | None = None
+        self._sampleable: tuple[NDArray[np.int64], list[SourceRing]] | None = None
         self._ids: I64 | None = None
 
     # ------------------------------------------------------------------------------------------
@@ -195,7 +96,7 @@ class Trajectories:
         """
         source = self._sources.get(chunk.source)
         if source is None:
-            source = _Source(
+            source = SourceRing(
                 chunk.source,
                 self.observation_size,
                 self.action_size,
@@ -210,25 +111,10 @@ class Trajectories:
                 f'taken. Raise memory_steps ({self.capacity})'
             )
         episode = self._episode_of(source, chunk)
-        rows = np.arange(source.end, source.end + chunk.steps) % source.capacity
-        source.observations[rows] = chunk.observations[:-1]
-        source.actions[rows] = chunk.actions
-        source.labels[rows] = np.nan
-        source.versions[rows] = 0
-        source.terminated[rows] = False
-        source.last[rows] = False
-        if episode.steps:
-            del source.finals[source.end - 1]
-            source.last[(source.end - 1) % source.capacity] = False
-        source.end += chunk.steps
-        episode.steps += chunk.steps
-        episode.ended = chunk.terminated or chunk.truncated
-        source.finals[source.end - 1] = chunk.observations[-1].copy()
-        source.last[rows[-1]] = True
-        source.terminated[rows[-1]] = chunk.terminated
+        source.append(chunk, episode)
         self._sampleable = None
 
-    def _episode_of(self, source: _Source, chunk: Transitions) -> _Episode:
+    def _episode_of(self, source: SourceRing, chunk: Transitions) -> Episode:
         last = source.newest
         expected = (0, 0)
         if last is not None:
@@ -249,7 +135,7 @@ class Trajectories:
                     f'observation is not the one that the steps before ended with'
                 )
             return last
-        episode = _Episode(chunk.episode, source.end, self._order)
+        episode = Episode(chunk.episode, source.end, self._order)
         self._order += 1
         source.newest = episode
         source.episodes.append(episode)
@@ -323,14 +209,7 @@ class Trajectories:
             if not ended:
                 break  # unfinished episodes are all there is: they must not be cut
             source = min(ended, key=lambda s: s.episodes[0].order)
-            episode = source.episodes.popleft()
-            del source.by_number[episode.number]
-            rows = np.arange(episode.start, episode.start + episode.steps)
-            source.labels[rows % source.capacity] = np.nan
-            del source.finals[int(rows[-1])]
-            source.drop_segments(episode)
-            source.start = episode.start + episode.steps
-            gone += episode.steps
+            gone += source.evict_oldest()
         self._ids = self._sampleable = None
         self.evicted += gone
         return gone
@@ -456,7 +335,7 @@ class Trajectories:
                 getattr(result, name)[mine] = getattr(some, name)
         return result
 
-    def _labelled(self) -> tuple[NDArray[np.int64], list[_Source]]:
+    def _labelled(self) -> tuple[NDArray[np.int64], list[SourceRing]]:
         if self._sampleable is None:
             sources = [self._sources[name] for name in sorted(self._sources)]
             width = self.capacity + self._margin
@@ -468,7 +347,7 @@ class Trajectories:
         return self._sampleable
 
     @staticmethod
-    def _steps(source: _Source, slots: NDArray[np.int64]) -> StepBatch:
+    def _steps(source: SourceRing, slots: NDArray[np.int64]) -> StepBatch:
         following = source.observations[(slots + 1) % source.capacity]
         for i in np.flatnonzero(source.last[slots]):
             row = source.start + (int(slots[i]) - source.start) % source.capacity
@@ -584,7 +463,7 @@ class Trajectories:
         rows = np.concatenate(parts).astype(np.float64)
         return rows.mean(0), rows.std(0)
 
-    def _by_source(self, ids: I64) -> Iterator[tuple[int, _Source, NDArray[np.int64], I64]]:
+    def _by_source(self, ids: I64) -> Iterator[tuple[int, SourceRing, NDArray[np.int64], I64]]:
         names = sorted(self._sources)
         for index in np.unique(ids >> _SOURCE_SHIFT).tolist():
             source = self._sources[names[index]]

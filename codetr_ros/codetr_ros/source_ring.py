@@ -1,0 +1,126 @@
+"""The steps and segments of one source: where the memory D keeps its arrays."""
+
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from codetr_ros.records import F32, Transitions
+
+
+@dataclass(slots=True)
+class Episode:
+    """Where an episode's steps lie, and which of its segments are scored."""
+
+    number: int
+    start: int  # row of its first step
+    order: int  # episodes leave the memory in the order in which they came
+    steps: int = 0
+    ended: bool = False
+    scored: dict[int, int] = field(default_factory=dict)  # first step -> segment number
+
+
+class SourceRing:
+    """The steps of one source, in a ring: row r lies in slot r % capacity, rows only grow."""
+
+    def __init__(
+        self, name: str, observation_size: int, action_size: int, capacity: int, true_rewards: bool
+    ) -> None:
+        self.name = name
+        self.capacity = capacity
+        # np.empty takes memory page by page as steps arrive, not at once
+        self.observations = np.empty((capacity, observation_size), np.float32)
+        self.actions = np.empty((capacity, action_size), np.float32)
+        self.labels = np.empty(capacity, np.float32)  # NaN: not labelled
+        self.versions = np.empty(capacity, np.uint32)
+        self.terminated = np.empty(capacity, np.bool_)
+        # the last step so far of its episode, whose next observation is in `finals`
+        self.last = np.empty(capacity, np.bool_)
+        self.true_rewards = np.empty(capacity, np.float32) if true_rewards else None
+        self.finals: dict[int, F32] = {}
+        self.start = 0
+        self.end = 0
+        self.episodes: deque[Episode] = deque()
+        # kept when it is evicted: the next steps follow on it
+        self.newest: Episode | None = None
+        self.by_number: dict[int, Episode] = {}
+        # segments, grown by doubling; number n lies at n - first_segment
+        self.first_segment = 0
+        self.segments = 0
+        self.segment_rows = np.empty(64, np.int64)
+        self.segment_lengths = np.empty(64, np.int64)
+        self.segment_offsets = np.empty(64, np.int64)  # first step within the episode
+        self.segment_episodes = np.empty(64, np.int64)
+        self.segment_values = np.empty(64, np.float64)
+        self.alive = np.empty(64, np.bool_)
+
+    @property
+    def steps(self) -> int:
+        """Steps held."""
+        return self.end - self.start
+
+    def append(self, chunk: Transitions, episode: Episode) -> None:
+        """Add steps that follow on those of the episode."""
+        rows = np.arange(self.end, self.end + chunk.steps) % self.capacity
+        self.observations[rows] = chunk.observations[:-1]
+        self.actions[rows] = chunk.actions
+        self.labels[rows] = np.nan
+        self.versions[rows] = 0
+        self.terminated[rows] = False
+        self.last[rows] = False
+        if episode.steps:
+            del self.finals[self.end - 1]
+            self.last[(self.end - 1) % self.capacity] = False
+        self.end += chunk.steps
+        episode.steps += chunk.steps
+        episode.ended = chunk.terminated or chunk.truncated
+        self.finals[self.end - 1] = chunk.observations[-1].copy()
+        self.last[rows[-1]] = True
+        self.terminated[rows[-1]] = chunk.terminated
+
+    def evict_oldest(self) -> int:
+        """Drop the oldest episode with its segments; how many steps went."""
+        episode = self.episodes.popleft()
+        del self.by_number[episode.number]
+        rows = np.arange(episode.start, episode.start + episode.steps)
+        self.labels[rows % self.capacity] = np.nan
+        del self.finals[int(rows[-1])]
+        self._drop_segments(episode)
+        self.start = episode.start + episode.steps
+        return episode.steps
+
+    def add_segment(self, row: int, length: int, offset: int, episode: int, value: float) -> int:
+        """Add a scored segment; its number."""
+        at = self.segments
+        for name in ('rows', 'lengths', 'offsets', 'episodes', 'values'):
+            self._grow(f'segment_{name}', at)
+        self._grow('alive', at)
+        self.segment_rows[at], self.segment_lengths[at], self.segment_offsets[at] = (
+            row,
+            length,
+            offset,
+        )
+        self.segment_episodes[at], self.segment_values[at], self.alive[at] = episode, value, True
+        self.segments += 1
+        return self.first_segment + at
+
+    def _grow(self, name: str, needed: int) -> None:
+        array = getattr(self, name)
+        if needed >= len(array):
+            setattr(self, name, np.concatenate([array, np.empty_like(array)]))
+
+    def _drop_segments(self, episode: Episode) -> None:
+        for number in episode.scored.values():
+            self.alive[number - self.first_segment] = False
+        dead = (
+            int(np.argmax(self.alive[: self.segments]))
+            if self.alive[: self.segments].any()
+            else self.segments
+        )
+        if dead > self.segments // 2 and dead >= 64:
+            for name in ('rows', 'lengths', 'offsets', 'episodes', 'values'):
+                array = getattr(self, f'segment_{name}')
+                array[: self.segments - dead] = array[dead : self.segments].copy()
+            self.alive[: self.segments - dead] = self.alive[dead : self.segments].copy()
+            self.first_segment += dead
+            self.segments -= dead
