@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from codetr_ros import run_folder
+from codetr_ros import middleware, run_folder
 from codetr_ros.config import Settings
 
 EXECUTABLES = {
@@ -104,10 +104,7 @@ def commands(
 def environment(settings: Settings, environ: Mapping[str, str] = os.environ) -> dict[str, str]:
     """The environment of a run's processes: this one's, with what the run needs."""
     return {
-        # Only this host is looked at unless the user asks for more.
-        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-        # Asynchronous publication adds a thread and a copy, and orders nothing better.
-        'RMW_FASTRTPS_PUBLICATION_MODE': 'SYNCHRONOUS',
+        **middleware.DEFAULTS,
         'PYTHONUNBUFFERED': '1',
         **environ,
         **threading_environment(settings),

@@ -95,14 +95,20 @@ class Peers:
             return f'{said.role} {said.node} has finished'
         return None
 
+    def newest(self) -> list[Peer]:
+        """The newest instance of each node: one that was killed says no last word, and does not
+        count once another has taken its place.
+        """
+        found: dict[str, Peer] = {}
+        for peer in self.by_instance.values():
+            old = found.get(peer.said.node)
+            if old is None or peer.heard >= old.heard:
+                found[peer.said.node] = peer
+        return list(found.values())
+
     def alive(self, role: str) -> list[Peer]:
         """Peers of a role, the newest instance of each node."""
-        newest: dict[str, Peer] = {}
-        for peer in self.by_instance.values():
-            old = newest.get(peer.said.node)
-            if peer.said.role == role and (old is None or peer.heard >= old.heard):
-                newest[peer.said.node] = peer
-        return list(newest.values())
+        return [peer for peer in self.newest() if peer.said.role == role]
 
     def absent(self, settings: Settings, settings_hash: str) -> list[str]:
         """Roles of which too few nodes with the run's settings are there, with what would start
@@ -129,7 +135,7 @@ class Peers:
 
     def anybody_left(self) -> bool:
         """Whether some peer has not finished."""
-        return any(not peer.said.finished for peer in self.by_instance.values())
+        return any(not peer.said.finished for peer in self.newest())
 
     def told(self) -> 'Counter[str]':
         """Records that all peers say they have published, by topic."""

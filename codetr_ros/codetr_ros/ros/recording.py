@@ -1,9 +1,9 @@
 """The recorder's wiring: writes what arrives as it came, and commits phases.
 
-Everything is appended to the bag as received bytes before the core sees it, and the bag is flushed
-and synced before a commit goes out: nobody learns from what could be lost. Without a bag the last
-phases are kept in memory only. In both cases the service `fetch_phase` sends one of the last
-committed phases again.
+Everything of the run is appended to the bag as received bytes before the core sees it, sound or
+not, and the bag is flushed and synced before a commit goes out: nobody learns from what could be
+lost. What belongs to another run is refused and not recorded. The last phases are kept in memory
+too, and the service `fetch_phase` sends one of them again.
 """
 
 import time
@@ -20,6 +20,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from codetr_ros import run_folder
 from codetr_ros.bags.writer import BagTopic, McapWriter
 from codetr_ros.config import Settings
+from codetr_ros.intake import check_run
 from codetr_ros.records import (
     TOPICS,
     Commit,
@@ -83,11 +84,11 @@ class LastPhases:
         self._phases = phases
 
     def hold(self, record: Record, raw: bytes) -> None:
-        """Keep the bytes of a record that a commit will name."""
+        """Keep the bytes of a record that the core has taken: a commit will name it."""
         if isinstance(record, Transitions):
-            self._open.setdefault((Transitions, record.source, record.sequence), raw)
+            self._open[Transitions, record.source, record.sequence] = raw
         elif isinstance(record, CompositeReward):
-            self._open.setdefault((CompositeReward, record.scorer, record.sequence), raw)
+            self._open[CompositeReward, record.scorer, record.sequence] = raw
 
     def commit(self, commit: Commit, raw: bytes) -> None:
         """File under the commit's phase what it names; forget the oldest phase."""
@@ -171,10 +172,13 @@ class RecordNode(CoreNode):
         self.received[TOPICS[kind]] += 1
         message = deserialize_message(raw, messages.message_type(kind))
         published = message.stamp.sec * 10**9 + message.stamp.nanosec
+        assert self.run_spec is not None
         try:
             record = messages.from_message(message)
+            check_run(record, self.run_spec)
         except RecordError as error:
-            self._write(kind, raw, published)  # the bag tells what came, sound or not
+            if message.run_id == self.run_spec.run_id:
+                self._write(kind, raw, published)  # the bag tells what came, sound or not
             self.refuse(kind, error)
             return
         kept = (
@@ -186,9 +190,10 @@ class RecordNode(CoreNode):
             self._write(
                 kind, serialize_message(messages.to_message(kept, message.stamp)), published
             )
-        if self.core is not None and kind in self.core.subscribes:
+        if self.core is None or kind not in self.core.subscribes:
+            return
+        if self._receive(record):
             self._last.hold(record, raw)
-            self._receive(record)
 
     def _write(self, kind: type, raw: bytes, published: int | None = None) -> None:
         now = self.link.node.get_clock().now().nanoseconds
@@ -243,9 +248,7 @@ class RecordNode(CoreNode):
     def settled(self, seconds: float) -> bool:
         """Whether everybody has finished and all that they published is in the bag."""
         running = [
-            f'{p.said.role} {p.said.node}'
-            for p in self.peers.by_instance.values()
-            if not p.said.finished
+            f'{p.said.role} {p.said.node}' for p in self.peers.newest() if not p.said.finished
         ]
         self._missed = self._still_missing()
         if not running and not self._missed:

@@ -1,0 +1,102 @@
+"""When waiting is pointless: what a node waits for is lost, or who would send it is gone."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from codetr_ros.ros.errors import NodeError
+from codetr_ros.ros.peers import Peers
+
+NAME_EVERY = 5.0  # [s] between two complaints about the same peers
+GRACE = 10.0  # [s] for what a peer published before it finished
+
+CANNOT_FINISH_BEFORE: dict[str, tuple[str, ...]] = {
+    'sim': ('learner',),
+    'evaluate': ('learner',),
+    'reward': ('record',),
+    'learner': ('reward', 'record'),
+    'record': ('sim', 'learner'),
+}
+"""Roles that have finished only if they were stopped, as long as a node of this role still waits
+for something."""
+
+
+class Patience:
+    """Watches over a node that waits amid the run.
+
+    Args:
+        who: fully qualified name of the node.
+        role: its role.
+        topics: what it waits for comes on one of these.
+        peers: the other nodes.
+        deadline: seconds of patience; 0: for ever.
+        log: the node's logger.
+    """
+
+    def __init__(
+        self,
+        who: str,
+        role: str,
+        topics: Sequence[str],
+        peers: Peers,
+        deadline: float,
+        log: Any,
+    ) -> None:
+        self._who = who
+        self._role = role
+        self._topics = topics
+        self._peers = peers
+        self._deadline = deadline
+        self._log = log
+        self._named: dict[str, float] = {}
+
+    def check(self, now: float, waiting: float, doing: str, lost: Mapping[str, int]) -> None:
+        """Name peers that fell silent, and give up on what will not come.
+
+        Args:
+            now: monotonic time [s].
+            waiting: seconds for which the node has waited.
+            doing: what it waits for, in words.
+            lost: records by topic that were published and have not come, not even when they were
+                asked for again.
+
+        Raises:
+            NodeError: a peer that we wait for is gone, or what we wait for is lost.
+        """
+        self._check_silent(now, waiting, doing)
+        self._check_finished(now, waiting, doing)
+        if lost and self._deadline and waiting > self._deadline:
+            lacking = ', '.join(f'{n} of {topic!r}' for topic, n in sorted(lost.items()))
+            raise NodeError(
+                f'{self._who} gave up after {waiting:.0f} s: it {doing}, and messages that were '
+                f'published never reached it: {lacking} (parameter peer_deadline = '
+                f'{self._deadline:g}). Look for an overloaded machine or network, and start the '
+                f'run again'
+            )
+
+    def _check_silent(self, now: float, waiting: float, doing: str) -> None:
+        for peer in self._peers.awaited(self._topics):
+            silent = now - peer.heard
+            if peer.said.finished or silent < 2 * NAME_EVERY:
+                continue
+            who = f'{peer.said.role} {peer.said.node}'
+            if self._deadline and silent > self._deadline and waiting > self._deadline:
+                raise NodeError(
+                    f'{self._who} gave up: it {doing}, and {who} has been silent for '
+                    f'{silent:.0f} s (parameter peer_deadline = {self._deadline:g}). Look at its '
+                    f'log, and start the run again'
+                )
+            if now - self._named.get(who, 0.0) > NAME_EVERY:
+                self._named[who] = now
+                self._log.warning(f'{who} has been silent for {silent:.0f} s; {doing}')
+
+    def _check_finished(self, now: float, waiting: float, doing: str) -> None:
+        for role in CANNOT_FINISH_BEFORE[self._role]:
+            gone = [peer for peer in self._peers.alive(role) if peer.said.finished]
+            all_gone = gone and len(gone) == len(self._peers.alive(role))
+            patience = GRACE if all_gone else max(GRACE, self._deadline)
+            if gone and waiting > patience and all(now - peer.heard > GRACE for peer in gone):
+                names = ', '.join(peer.said.node for peer in gone)
+                raise NodeError(
+                    f'{self._who} gave up: it {doing}, but {role} {names} stopped before the run '
+                    f'was over. Look at its log, and start the run again'
+                )

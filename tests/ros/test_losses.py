@@ -1,0 +1,230 @@
+"""What was published and did not arrive: asked for again, counted, and not waited for in vain."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from builders import commit, policy, score, step_rewards, task_spec, tiny, transitions
+from builtin_interfaces.msg import Time
+from codetr_msgs.srv import FetchPhase
+from codetr_ros.records import Commit, CompositeReward, Presence, RecordError, Transitions
+from codetr_ros.ros import messages
+from codetr_ros.ros.fetch import unpack
+from codetr_ros.ros.node import CoreNode
+from codetr_ros.ros.patience import Patience
+from codetr_ros.ros.peers import Peers
+from codetr_ros.ros.recording import LastPhases
+from codetr_ros.ros.signals import Stop
+from diagnostic_msgs.msg import DiagnosticArray
+from ros.playing import NAMESPACE, output, process
+from rosbags.highlevel import AnyReader
+
+from codetr_ros import run_folder
+
+
+def settings():
+    """One phase, which is labelled without being learnt from."""
+    return tiny(steps=5, phase_steps=5, warmup_steps=5, evaluate_every=0, method='uniform')
+
+
+def read_by(play, *nodes):
+    """Whether these nodes read what the test publishes for simulators."""
+    topics = ['transitions', 'composite_rewards', 'task']
+    names = {f'{NAMESPACE}/{node}' for node in nodes}
+    return not play.links['sim'].unmatched(topics, lambda _: names, readers=True)
+
+
+def publish_a_phase(play):
+    sim, learner = play.links['sim'], play.links['learner']
+    sim.publish(task_spec())
+    learner.publish(policy(steps=np.array([5], np.uint32)))
+    sim.publish(transitions(phase_end=True, scores_due=1, terminated=True))
+    sim.publish(score(length=5))
+
+
+def test_a_phase_that_a_node_lacks_is_fetched_from_the_recorder_and_the_loss_is_excused(
+    play, tmp_path
+):
+    play = play(settings=settings(), roles=('learner', 'sim'))
+    with (
+        process('record') as record,
+        process('deaf', f'folder:={tmp_path}', 'peer_deadline:=20.0') as deaf,
+    ):
+        play.until(lambda: read_by(play, 'record', 'reward'), deaf)
+        publish_a_phase(play)
+        labels = play.until(lambda: play.messages('StepRewards', 'learner'), deaf)[0]
+        assert list(labels.lengths) == [5]
+        play.until(lambda: [p for p in play.presence_of('reward') if p.finished])
+        play.finished = True
+        play.until(lambda: deaf.poll() is not None and record.poll() is not None)
+        said = output(deaf)
+    assert deaf.returncode == 0, said
+    assert 'phase 0 is incomplete: asking the recorder for it' in said
+    report = run_folder.read_report(run_folder.report_path(tmp_path, 'reward', 'reward'))
+    assert report['fetched'] == {'transitions': 1}
+    assert report['lost'] == {}
+    assert report['duplicated'] == {'composite_rewards': 1}
+    missed = [presence.missed for presence in play.presence_of('reward')]
+    assert missed[-1] == 0
+
+
+def test_a_node_gives_up_on_what_was_lost_for_good_naming_topic_and_count(play):
+    play = play(settings=settings(), roles=('learner', 'sim', 'record'))
+    with process('deaf', 'peer_deadline:=7.0') as deaf:  # and nobody offers to send anything again
+        play.until(lambda: read_by(play, 'reward'), deaf)
+        publish_a_phase(play)
+        play.links['record'].publish(
+            commit(scores=np.zeros(1, np.int64)),
+        )
+        play.until(lambda: deaf.poll() is not None)
+        said = output(deaf)
+    assert deaf.returncode == 1
+    assert "messages that were published never reached it: 1 of 'transitions'" in said
+    assert 'Traceback' not in said
+    assert max(presence.missed for presence in play.presence_of('reward')) == 1
+
+
+@pytest.mark.parametrize(
+    ('waiting', 'deadline', 'lost'),
+    [(61.0, 60.0, {}), (59.0, 60.0, {'commits': 1}), (1e6, 0.0, {'commits': 1})],
+    ids=['nothing is lost', 'it may still come', 'for ever'],
+)
+def test_waiting_is_not_pointless_as_long_as(waiting, deadline, lost):
+    patience = Patience('/r/learner', 'learner', ['commits'], Peers('learner'), deadline, None)
+    patience.check(1e6, waiting, 'waits', lost)
+
+
+class Core:
+    """A core that has seen some trouble."""
+
+    subscribes = (Transitions,)
+    finished = False
+    missing = None
+
+    def __init__(self):
+        self.duplicated = Counter(transitions=2)
+        self.refused = Counter(composite_rewards=3)
+
+    def receive(self, record):
+        if record.sequence < 0:
+            raise RecordError('no')
+        self.duplicated['transitions'] += record.sequence == 0
+
+
+@pytest.fixture
+def member(play):
+    """A node with such a core."""
+    play(roles=())
+    node = CoreNode('reward', 'reward', lambda: None, Stop())
+    node.link.advertise(['presence'])
+    node.core = Core()
+    yield node
+    node.link.close()
+
+
+def test_diagnostics_tell_what_the_core_has_dropped_and_refused_later(member, play):
+    witness = play(roles=('sim',))
+    heard = []
+    witness.links['sim'].node.create_subscription(
+        DiagnosticArray, '/diagnostics', heard.append, 10
+    )
+    member.refuse(Transitions, RecordError('wrong'))
+
+    def said():
+        member._tell()
+        return [s for a in heard for s in a.status if s.name == f'{NAMESPACE}/reward: messages']
+
+    status = witness.until(said)[0]
+    values = {value.key: value.value for value in status.values}
+    assert values['duplicated transitions'] == '2'
+    assert values['refused composite_rewards'] == '3'
+    assert values['refused transitions'] == '1'
+    assert status.level == b'\x01'
+
+
+def test_what_came_and_was_refused_is_not_lost(member):
+    message = messages.to_message(transitions(), Time())
+    message.actions = message.actions[:3]  # of another length than it says
+    member._take(Transitions, message)
+    assert member.refused == {'transitions': 1}
+    assert member.received == {'transitions': 1}
+
+
+def test_what_is_fetched_counts_as_recovered_only_if_it_was_new_and_taken(member):
+    for record in (transitions(sequence=0), transitions(sequence=-1), transitions(sequence=4)):
+        member._receive_again(record)
+    assert member.recovered == {'transitions': 1}
+
+
+def test_what_the_core_has_not_taken_is_not_sent_again(play, tmp_path):
+    play = play()
+    with process('record', f'folder:={tmp_path}') as node:
+        play.until(lambda: read_by(play, 'record'), node)
+        sim = play.links['sim']
+        heard = []
+        sim.node.create_subscription(DiagnosticArray, '/diagnostics', heard.append, 10)
+        sim.publish(task_spec())
+        play.links['learner'].publish(policy(steps=np.array([5], np.uint32)))
+        sim.publish(transitions(phase_end=True, scores_due=1))
+        sim.publish(transitions(observations=np.full((6, 3), np.nan, np.float32)))
+        sim.publish(transitions(sequence=3))
+        sim.publish(transitions(run_id='another'))
+        play.links['reward'].publish(step_rewards(run_id='another'))
+        refused = [('refused step_rewards', '1'), ('refused transitions', '3')]
+        play.until(
+            lambda: any(
+                [(v.key, v.value) for v in s.values if v.key.startswith('refused')] == refused
+                for a in heard
+                for s in a.status
+                if s.hardware_id == 'record'
+            )
+        )
+        sim.publish(score(length=5))
+        play.until(lambda: play.messages('Commit', 'learner'))
+        client = play.links['learner'].node.create_client(FetchPhase, 'fetch_phase')
+        play.until(client.service_is_ready)
+        future = client.call_async(FetchPhase.Request(run_id='run', phase=0))
+        play.until(future.done)
+        sent = unpack(future.result())
+        play.finished = True
+        play.until(lambda: node.poll() is not None)
+        said = output(node)
+    assert node.returncode == 0, said
+    assert [type(record) for record in sent] == [Transitions, CompositeReward, Commit]
+    assert np.isfinite(sent[0].observations).all()
+    with AnyReader([tmp_path / 'bag']) as bag:
+        runs = {bag.deserialize(raw, c.msgtype).run_id for c, _, raw in bag.messages()}
+    assert runs == {'run'}
+    report = run_folder.read_report(run_folder.report_path(tmp_path, 'record', 'record'))
+    assert report['refused'] == {'transitions': 3, 'step_rewards': 1}
+    assert report['recorded']['transitions'] == 3  # of this run: one sound, two not
+    assert 'step_rewards' not in report['recorded']
+
+
+def test_the_last_phases_keep_what_a_commit_names_once():
+    last = LastPhases(2)
+    last.hold(transitions(), b'a')
+    last.hold(score(), b'b')
+    last.commit(commit(scores=np.zeros(1, np.int64)), b'c')
+    assert [raw for _, raw in last.get(0)] == [b'a', b'b', b'c']
+    last.commit(commit(phase=1), b'd')
+    assert last.get(1) == [(Commit, b'd')]
+
+
+def test_of_a_node_that_was_killed_and_started_again_only_the_newest_instance_counts():
+    peers = Peers('record')
+
+    def said(instance, finished):
+        published = np.array([2], np.uint64)
+        return Presence(
+            'run', 'evaluate', '/r/evaluate', instance, '', finished, ('metrics',), published, 0
+        )
+
+    peers.hear(said('killed', False), 1.0)
+    assert peers.anybody_left()
+    peers.hear(said('started again', False), 2.0)
+    assert peers.anybody_left()
+    peers.hear(said('started again', True), 3.0)
+    assert not peers.anybody_left()
+    assert [peer.said.instance_id for peer in peers.newest()] == ['started again']
+    assert peers.told() == {'metrics': 4}  # what both have said
