@@ -107,8 +107,8 @@ def outcome(tmp_path_factory):
         witness.until(
             lambda: (
                 refused('record', 'transitions') == 5
-                and refused('reward', 'transitions') == 4
-                and refused('learner', 'transitions') == 4
+                and refused('reward', 'transitions') == 5
+                and refused('learner', 'transitions') == 5
                 and refused('record', 'composite_rewards') == 1
                 and refused('reward', 'composite_rewards') == 1
                 and refused('evaluate', 'policy') == 1
@@ -150,13 +150,18 @@ def test_wrong_transitions_are_refused_by_all_that_read_them(outcome, node, why)
     assert sum(why in said for said in outcome.refusals(node, 'transitions')) == 1
 
 
-def test_transitions_out_of_sequence_are_refused_by_the_recorder_that_commits(outcome):
-    said = outcome.refusals('record', 'transitions')
+def test_transitions_out_of_sequence_are_refused_by_all_that_read_them(outcome):
     assert re.search(
         r"sequence=1000000.* is out of sequence: \d+ is the next of 'sim'. What lies between "
         r"never arrived: restart 'sim'",
-        said[-1],
+        outcome.refusals('record', 'transitions')[-1],
     )
+    for node in ('reward', 'learner'):
+        assert re.search(
+            r'sequence=1000000.* is out of sequence: the permitted phases hold fewer than 400 '
+            r"records, and \d+ is the next of 'sim' to be taken in",
+            outcome.refusals(node, 'transitions')[-1],
+        )
 
 
 def test_what_arrives_again_is_counted_as_duplicated_and_dropped(outcome):
@@ -205,7 +210,7 @@ def test_every_refusal_is_counted_in_the_report_of_the_node(outcome):
     assert refused == {
         'sim': {'policy': 2},
         'evaluate': {'policy': 1},
-        'reward': {'transitions': 4, 'composite_rewards': 4},
-        'learner': {'transitions': 4},
-        'record': {'transitions': 5, 'composite_rewards': 1},
+        'reward': {'transitions': 5, 'composite_rewards': 4},
+        'learner': {'transitions': 5},
+        'record': {'transitions': 5, 'composite_rewards': 1, 'policy': 1},
     }

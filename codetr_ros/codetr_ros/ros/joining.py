@@ -17,6 +17,7 @@ from codetr_ros.ros.patience import NAME_EVERY
 from codetr_ros.ros.peers import READERS, WRITERS, needed, published_by
 
 IDLE = 0.05  # [s] blocked in the executor while there is nothing to do: the longest a signal waits
+NAME_PATIENCE = 2.0  # [s] for the name of a node whose topics are known
 
 
 def refuse_reference(who: str, settings: Settings) -> None:
@@ -92,16 +93,27 @@ class Joining(Member):
         self._enter()
         return True
 
+    def _owner(self) -> str:
+        """The learner whose run it is, for errors: its topics are discovered before its name."""
+        node = self.link.node
+        end = time.monotonic() + NAME_PATIENCE
+        while not self.stop:
+            names = sorted(
+                f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+                for info in node.get_publishers_info_by_topic(node.resolve_topic_name('run'))
+                if info.node_name != '_NODE_NAME_UNKNOWN_'
+            )
+            if names or time.monotonic() > end:
+                return f'learner {" or ".join(names) or "of the run"}'
+            self._turn(IDLE)
+        return 'learner of the run'
+
     def _enter(self) -> None:
         """Take the run's settings, make the core, open the topics."""
         assert self.run_spec is not None
         node = self.link.node
         if self.settings is None:
-            owners = [
-                f'{info.node_namespace.rstrip("/")}/{info.node_name}'
-                for info in node.get_publishers_info_by_topic(node.resolve_topic_name('run'))
-            ]
-            owner = f'learner {" or ".join(owners) or "of the run"}'
+            owner = self._owner()
             self.settings = from_canonical(
                 self.run_spec.settings, f'run {self.run_spec.run_id!r} of {owner}'
             )
