@@ -38,6 +38,7 @@ def settings(**changes) -> Settings:
         # steps depend on each other from the start, so that what is seen where can be told
         'codetr__initialisation': 'lecun',
         'codetr__dropout': 0.0,
+        'codetr__head_scale': 'inverse_sqrt',
         'codetr__layers': 2,
         'codetr__window': 10,
         'delay': DELAY,

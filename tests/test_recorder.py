@@ -100,3 +100,19 @@ def test_steps_of_another_run_or_source_or_with_nan_are_refused():
         with pytest.raises(RecordError, match=said):
             r.receive(wrong)
     r.receive(transitions())  # still the first
+
+
+def test_steps_that_come_before_their_announcement_are_checked_when_it_has_come():
+    """They travel on different topics: which comes first is not promised."""
+    settings = tiny()
+    r = Recorder(run(settings), settings, 'record')
+    nan = np.full((6, 3), np.nan, np.float32)
+    r.receive(transitions(observations=nan))
+    r.receive(transitions())
+    r.receive(transitions(sequence=1, first_step=5))
+    assert r.report()['duplicated'] == {}
+    r.receive(task_spec())
+    assert r.report()['refused'] == {'transitions': 1}
+    assert r.report()['duplicated'] == {}
+    with pytest.raises(RecordError, match='2 is the next'):
+        r.receive(transitions(sequence=5))
