@@ -15,7 +15,7 @@ and each variant of the model it gives
     (1 on average)
 
 over held-out steps. A high R^2 says little about the steps, which is why the others are here.
-Rows that are in the file already are not run again.
+Rows that are in the file already are not run again. Means over seeds go beside it as Markdown.
 """
 
 import argparse
@@ -169,6 +169,27 @@ def measure(
     }
 
 
+def write_table(path: Path) -> None:
+    """Means over seeds, as Markdown beside the CSV."""
+    with path.open() as file:
+        rows = list(csv.DictReader(file))
+    shown = COLUMNS[4:10]
+    lines = [
+        f'| composite | variant | seeds | {" | ".join(shown)} | within_pearson, by seed |',
+        '|---|---|---:|' + '---:|' * len(shown) + '---|',
+    ]
+    groups: dict[tuple[str, str, str], list[dict[str, str]]] = {}
+    for row in rows:
+        groups.setdefault((row['composite'], row['variant'], row['gradient_steps']), []).append(
+            row
+        )
+    for (name, variant, _), group in groups.items():
+        means = [f'{sum(float(row[c]) for row in group) / len(group):.2f}' for c in shown]
+        each = ', '.join(f'{float(row["within_pearson"]):.2f}' for row in group)
+        lines.append(f'| {name} | {variant} | {len(group)} | {" | ".join(means)} | {each} |')
+    path.with_suffix('.md').write_text('\n'.join(lines) + '\n')
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -211,6 +232,7 @@ def main() -> None:
                     with arguments.out.open('a') as file:
                         csv.writer(file, lineterminator='\n').writerow(line)
                     print(*line, flush=True)
+    write_table(arguments.out)
 
 
 if __name__ == '__main__':
