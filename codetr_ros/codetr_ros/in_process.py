@@ -119,18 +119,21 @@ def run(
         reports = {}
         for name, (role, core) in cores.items():
             core.close()
-            reports[name] = {
-                'role': role,
-                'name': name,
-                'published': dict(published[name]),
-                'received': dict(received[name]),
-                'refused': {},
-                'peak_rss_mb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-                'cpu_s': seconds[name],
-                'wall_s': seconds[name],
-                'finished': core.finished,
-                'error': None,
-            } | core.report()
+            counts = {'published': dict(published[name]), 'received': dict(received[name])}
+            reports[name] = _report(role, name, core, seconds[name]) | counts
             if folder is not None:
                 run_folder.write_report(folder, role, name, reports[name])
     return reports
+
+
+def _report(role: str, name: str, core: Core, seconds: float) -> dict[str, Any]:
+    return {
+        'role': role,
+        'name': name,
+        'refused': {},
+        'peak_rss_mb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        'cpu_s': seconds,
+        'wall_s': seconds,
+        'finished': core.finished,
+        'error': None,
+    } | core.report()

@@ -121,9 +121,7 @@ class Transitions:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CompositeReward:
-    """The score of one segment. From whoever scores to recorder, reward, and learners that use it
-    directly.
-    """
+    """The score of one segment. From whoever scores to recorder and reward."""
 
     run_id: str
     source: str  # whose segment it is
@@ -137,9 +135,7 @@ class CompositeReward:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Commit:
-    """A phase is on disk, whole: exactly these records belong to it. From the recorder to reward
-    and learner.
-    """
+    """A phase is on disk, whole: exactly this belongs to it. Recorder to reward and learner."""
 
     run_id: str
     phase: int
@@ -152,9 +148,7 @@ class Commit:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class StepRewards:
-    """New and changed labels after a phase: part `part` of `parts`. From the reward node to
-    learner and recorder.
-    """
+    """New and changed labels after a phase, in parts. From reward to learner and recorder."""
 
     run_id: str
     phase: int
@@ -174,9 +168,7 @@ class EpisodeResult:
 
     run_id: str
     source: str
-    purpose: (
-        str  # 'training', 'evaluation' or 'random' (evaluation of the uniformly random policy)
-    )
+    purpose: str  # 'training', 'evaluation', or 'random': an evaluation of the random policy
     # training steps that the policy has learnt from (evaluation), or that the run has taken if all
     # its sources are as far in the phase as this one (training)
     step: int
@@ -185,17 +177,13 @@ class EpisodeResult:
     length: int
     true_return: float
     composite_return: float
-    score: (
-        float  # composite return / that of an agent that earns r_max at every step of the horizon
-    )
+    score: float  # composite_return / that of an agent that earns r_max at every step
     terminated: bool
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TrueRewards:
-    """The environment's own step rewards, for evaluation only: never for the learner or the reward
-    node.
-    """
+    """The environment's own step rewards, for evaluation only: no node learns from them."""
 
     run_id: str
     source: str
