@@ -26,16 +26,16 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy import stats
+
+from codetr_ros import in_process
 from codetr_ros.composite import composite
+from codetr_ros.config import Settings, load
 from codetr_ros.records import CompositeReward, Record, Transitions, TrueRewards
 from codetr_ros.rewards.codetr import Codetr
 from codetr_ros.rewards.method import segment_steps
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.trajectories import Trajectories
-from scipy import stats
-
-from codetr_ros import in_process
-from codetr_ros.config import Settings, load
 
 DELAY = 25
 COMPOSITES = ('sum', 'sum_square', 'square_sum', 'max')

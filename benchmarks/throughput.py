@@ -54,14 +54,14 @@ from typing import Any
 
 import numpy as np
 import torch
+
+from codetr_ros import rewards, tasks
+from codetr_ros.config import Settings, load
 from codetr_ros.learners.sac import SAC
 from codetr_ros.records import CompositeReward, StepRewards, Transitions
 from codetr_ros.rewards.method import segment_steps
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.trajectories import Trajectories
-
-from codetr_ros import rewards, tasks
-from codetr_ros.config import Settings, load
 
 RESULTS = Path(__file__).parent / 'results'
 LOUD = 0.5

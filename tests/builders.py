@@ -4,6 +4,8 @@ from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
+
+from codetr_ros.config import Settings, load
 from codetr_ros.records import (
     PROTOCOL_VERSION,
     Commit,
@@ -14,8 +16,6 @@ from codetr_ros.records import (
     TaskSpec,
     Transitions,
 )
-
-from codetr_ros.config import Settings, load
 
 OBSERVATION, ACTION = 3, 2
 

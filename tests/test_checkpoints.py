@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 import torch
-from codetr_ros.checkpoints import CheckpointError
 
 from codetr_ros import checkpoints
+from codetr_ros.checkpoints import CheckpointError
 
 
 def state() -> dict[str, torch.Tensor]:

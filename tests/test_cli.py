@@ -8,10 +8,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
-from codetr_ros.cli import flags, train
 from test_launcher import prefix
 
 from codetr_ros import cli, config, doctor, launcher, run_folder
+from codetr_ros.cli import flags, train
 from codetr_ros.config import Settings, SettingsError
 
 SMALL = {

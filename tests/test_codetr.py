@@ -9,15 +9,15 @@ import pytest
 import torch
 from builders import ACTION as A
 from builders import OBSERVATION as O
+
 from codetr_ros.composite import composite
+from codetr_ros.config import Settings
 from codetr_ros.records import CompositeReward, Transitions
 from codetr_ros.rewards import RewardModelError
 from codetr_ros.rewards.codetr import STD_FLOOR, Codetr, learning_rate
 from codetr_ros.rewards.transformer import CausalSelfAttention, RewardTransformer
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.trajectories import SegmentBatch, Trajectories
-
-from codetr_ros.config import Settings
 
 DELAY = 6
 TOKENS = ('pair', 'merged')

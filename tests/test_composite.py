@@ -5,11 +5,11 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from codetr_ros.composite import COMPOSITES, CompositeError, composite, perfect_score
 from hypothesis import given
 from hypothesis import strategies as st
 
 from codetr_ros import config
+from codetr_ros.composite import COMPOSITES, CompositeError, composite, perfect_score
 
 segments = st.lists(st.floats(-50, 50), min_size=1, max_size=12).map(np.array)
 signed = pytest.mark.parametrize('name', ['sum', 'sum_square', 'square_sum'])

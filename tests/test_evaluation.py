@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from builders import policy, same, tiny
 from builders import run as run_spec
+
+from codetr_ros import tasks
 from codetr_ros.config import SettingsError
 from codetr_ros.evaluation import Evaluator
 from codetr_ros.learners import network
 from codetr_ros.records import EpisodeResult, RecordError
 from codetr_ros.seeding import generator, seed_torch
-
-from codetr_ros import tasks
 
 TASK = 'Pendulum-v1'  # 200 steps, never terminates
 SIZES = (3, 1, (16, 16))

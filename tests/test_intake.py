@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from builders import ACTION, OBSERVATION, commit, follow, run, score, task_spec, tiny, transitions
+
 from codetr_ros.intake import Intake
 from codetr_ros.records import RecordError
 from codetr_ros.trajectories import Trajectories

@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+
+from codetr_ros import config, launcher, run_folder
 from codetr_ros.cli.supervise import Interrupts, Silence, supervise, why_it_gave_up
 from codetr_ros.launcher import Command, LaunchError, Node, Processes
 from codetr_ros.records import Commit, Presence
-
-from codetr_ros import config, launcher, run_folder
 
 PATIENCE = 20.0  # seconds after which a test gives up; nothing waits for it to pass
 

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 from builders import commit, run, score, step_rewards, task_spec, tiny, transitions
+
+from codetr_ros import in_process
 from codetr_ros.learners.core import Learner
 from codetr_ros.learners.sac import SacError
 from codetr_ros.records import (
@@ -14,8 +16,6 @@ from codetr_ros.records import (
     TrueRewards,
 )
 from codetr_ros.rewards.core import PART_BYTES, Labeller
-
-from codetr_ros import in_process
 
 
 def slices(work, most=10_000):

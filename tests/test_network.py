@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
+
 from codetr_ros.learners.network import (
     LOG_STD_RANGE,
     ActingPolicy,

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from builders import policy, run, score, task_spec, tiny, transitions
+
 from codetr_ros.recorder import Recorder
 from codetr_ros.records import Commit, RecordError
 

@@ -8,13 +8,13 @@ import pytest
 import torch
 from builders import ACTION as A
 from builders import OBSERVATION as O
+
+from codetr_ros import rewards
 from codetr_ros.config import IN_PROCESS_ONLY, Method, Settings
 from codetr_ros.records import F32, CompositeReward, TrueRewards
 from codetr_ros.rewards import RewardMethod, RewardModelError, segment_steps
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.trajectories import SegmentBatch, Trajectories
-
-from codetr_ros import rewards
 
 DELAY = 7
 LENGTHS = (24, 14, 3)  # a short last segment, none, and an episode shorter than a segment

@@ -2,9 +2,9 @@ import os
 from pathlib import Path
 
 import pytest
-from codetr_ros.run_folder import RunFolderError
 
 from codetr_ros import config, run_folder
+from codetr_ros.run_folder import RunFolderError
 
 
 def test_a_new_folder_gets_the_places_that_every_run_has(tmp_path: Path) -> None:

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
-from codetr_ros.learners.sac import SAC, SacError, q_values, squashed_gaussian
-from codetr_ros.trajectories import StepBatch
 from torch import nn
 
 from codetr_ros.config import SacSettings
+from codetr_ros.learners.sac import SAC, SacError, q_values, squashed_gaussian
+from codetr_ros.trajectories import StepBatch
 
 torch.set_num_threads(1)  # a second thread is slower at these sizes
 

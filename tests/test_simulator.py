@@ -8,6 +8,8 @@ import pytest
 import torch
 from builders import policy, same, task_spec, tiny
 from builders import run as run_spec
+
+from codetr_ros import records, tasks
 from codetr_ros.config import Settings, SettingsError
 from codetr_ros.learners import network
 from codetr_ros.records import (
@@ -22,8 +24,6 @@ from codetr_ros.records import (
 )
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.simulator import CHUNK_BYTES, CHUNK_STEPS, Simulator, chunk_steps
-
-from codetr_ros import records, tasks
 
 FALLS = 'InvertedPendulum-v5'  # within some ten steps under the random policy
 NEVER_ENDS = 'Pendulum-v1'  # 200 steps

@@ -11,7 +11,11 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @pytest.mark.parametrize(
     'command',
-    [['ruff', 'check', '.'], ['ruff', 'format', '--check', '.'], ['mypy']],
+    [
+        ['ruff', 'check', '--no-cache', '.'],
+        ['ruff', 'format', '--no-cache', '--check', '.'],
+        ['mypy'],
+    ],
     ids=['lint', 'format', 'types'],
 )
 def test_the_house_style_is_kept(command: list[str]):

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from codetr_ros.progress import Progress, duration
-from codetr_ros.records import Commit, EpisodeResult, Presence, Record, metrics
-from codetr_ros.summary import Summary
 
 from codetr_ros import config, report, run_folder, summary
 from codetr_ros.config import Settings
+from codetr_ros.progress import Progress, duration
+from codetr_ros.records import Commit, EpisodeResult, Presence, Record, metrics
+from codetr_ros.summary import Summary
 
 SETTINGS = config.load('quick').changed(
     {'steps': 2500, 'phase_steps': 1000, 'evaluate_every': 1000, 'evaluate_episodes': 2}

@@ -9,9 +9,10 @@ import gymnasium
 import numpy as np
 import pytest
 from builders import tiny
+from gymnasium import spaces
+
 from codetr_ros.config import SettingsError
 from codetr_ros.tasks import TASKS, TaskError, check, find, make, r_max
-from gymnasium import spaces
 
 NAMES = [
     *('HalfCheetah-v5', 'Hopper-v5', 'Walker2d-v5', 'Ant-v4', 'Humanoid-v5', 'Swimmer-v5'),

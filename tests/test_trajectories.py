@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from codetr_ros.records import CompositeReward, RecordError, StepRewards, Transitions
 from codetr_ros.trajectories import Trajectories
 

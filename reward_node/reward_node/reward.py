@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 def load() -> 'MakeCore':
     """Import the core and return what makes it."""
     import torch._dynamo  # noqa: F401 - the first optimiser imports it: seconds, amid the run
+
     from codetr_ros.rewards.core import Labeller
 
     return Labeller

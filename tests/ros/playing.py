@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from builders import policy, score, task_spec, transitions
+
 from codetr_ros.records import TOPICS, Presence, RunSpec
 from codetr_ros.ros import peers
 from codetr_ros.ros.link import Link

@@ -7,12 +7,13 @@ import textwrap
 import pytest
 from builders import transitions
 from builtin_interfaces.msg import Time
-from codetr_ros.bags.writer import BagError, BagTopic, McapWriter, schema_text, type_hash
-from codetr_ros.ros import messages
 from mcap.stream_reader import StreamReader
 from rclpy.serialization import serialize_message
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from codetr_ros.bags.writer import BagError, BagTopic, McapWriter, schema_text, type_hash
+from codetr_ros.ros import messages
 
 TRANSITIONS = BagTopic('/r/transitions', 'codetr_msgs/msg/Transitions', 100, False)
 COMMITS = BagTopic('/r/commits', 'codetr_msgs/msg/Commit', 16, True)

@@ -7,6 +7,11 @@ import pytest
 from builders import commit, policy, score, step_rewards, task_spec, tiny, transitions
 from builtin_interfaces.msg import Time
 from codetr_msgs.srv import FetchPhase
+from diagnostic_msgs.msg import DiagnosticArray
+from ros.playing import NAMESPACE, output, process
+from rosbags.highlevel import AnyReader
+
+from codetr_ros import run_folder
 from codetr_ros.records import Commit, CompositeReward, Presence, RecordError, Transitions
 from codetr_ros.ros import messages
 from codetr_ros.ros.fetch import unpack
@@ -15,11 +20,6 @@ from codetr_ros.ros.patience import Patience
 from codetr_ros.ros.peers import Peers
 from codetr_ros.ros.recording import LastPhases
 from codetr_ros.ros.signals import Stop
-from diagnostic_msgs.msg import DiagnosticArray
-from ros.playing import NAMESPACE, output, process
-from rosbags.highlevel import AnyReader
-
-from codetr_ros import run_folder
 
 
 def settings():

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from builders import same, transitions
 from builtin_interfaces.msg import Time
+from rclpy.serialization import deserialize_message, serialize_message
+
 from codetr_ros.records import (
     TOPICS,
     Commit,
@@ -20,7 +22,6 @@ from codetr_ros.records import (
     TrueRewards,
 )
 from codetr_ros.ros import messages, peers, qos
-from rclpy.serialization import deserialize_message, serialize_message
 
 STAMP = Time(sec=3, nanosec=4)
 ODD = np.array(

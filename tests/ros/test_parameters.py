@@ -1,11 +1,11 @@
 import pytest
 import rclpy
-from codetr_ros.ros import parameters
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from codetr_ros.config import Settings, load
+from codetr_ros.ros import parameters
 
 
 @pytest.fixture

@@ -8,9 +8,13 @@ import sys
 import pytest
 import yaml
 from builders import tiny
+from ros.playing import output, process
+
+from codetr_ros import middleware, run_folder
 from codetr_ros.bags.writer import BagError
 from codetr_ros.checkpoints import CheckpointError
 from codetr_ros.composite import CompositeError
+from codetr_ros.config import SettingsError, load
 from codetr_ros.learners.network import NetworkError
 from codetr_ros.learners.sac import SacError
 from codetr_ros.records import RecordError
@@ -19,10 +23,6 @@ from codetr_ros.ros import errors
 from codetr_ros.ros.node import CoreNode
 from codetr_ros.ros.signals import Stop
 from codetr_ros.tasks import TaskError
-from ros.playing import output, process
-
-from codetr_ros import middleware, run_folder
-from codetr_ros.config import SettingsError, load
 
 
 def refusal(*parameters, role='learner'):

@@ -11,9 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
-from codetr_ros.records import TOPICS, Commit, CompositeReward, Presence, Record
-from codetr_ros.ros import messages, qos
-from codetr_ros.ros.link import Link
 from diagnostic_msgs.msg import DiagnosticArray
 from domain_coordinator import domain_id
 from rclpy.parameter_client import AsyncParameterClient
@@ -21,6 +18,9 @@ from rclpy.signals import SignalHandlerOptions
 
 from codetr_ros import launcher, run_folder
 from codetr_ros.config import Settings
+from codetr_ros.records import TOPICS, Commit, CompositeReward, Presence, Record
+from codetr_ros.ros import messages, qos
+from codetr_ros.ros.link import Link
 
 PATIENCE = 120.0  # [s] a busy machine starts five nodes in 40
 RUN_ID = 'run'

@@ -12,12 +12,12 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS')
 
 from builders import policy, score, tiny, transitions
-from codetr_ros.learners import network
-from codetr_ros.records import CompositeReward, Policy, Record
 from system.nodes import Nodes, Witness, domain
 from system.runs import finish, start, write
 
 from codetr_ros.config import Settings
+from codetr_ros.learners import network
+from codetr_ros.records import CompositeReward, Policy, Record
 
 OBSERVATION, ACTION = 9, 1  # of InvertedDoublePendulum-v5
 LATER = 1_000_000  # a sequence number that the run never reaches

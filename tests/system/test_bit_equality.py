@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 from builders import tiny
-from codetr_ros.summary import Summary
 from system.runs import train
 
 from codetr_ros import in_process
 from codetr_ros.config import Settings
+from codetr_ros.summary import Summary
 
 # Episodes of the pendulum end early and at any step; those of the reacher at 50. Segments of 7
 # steps fit into neither a phase of 200 steps nor an episode of 50.

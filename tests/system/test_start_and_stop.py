@@ -11,14 +11,14 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS')
 
 from builders import tiny
-from codetr_ros.records import TOPICS, TrueRewards
-from codetr_ros.ros import peers
 from rcl_interfaces.msg import ParameterType
 from rosbags.highlevel import AnyReader
 from system.nodes import NAMESPACE, Nodes, Witness, domain
 from system.runs import finish, logs, processes_of, start, until, write
 
 from codetr_ros import checkpoints, run_folder
+from codetr_ros.records import TOPICS, TrueRewards
+from codetr_ros.ros import peers
 
 ENDLESS = 10_000_000  # steps
 STOPS = (signal.SIGINT, signal.SIGTERM)
