@@ -198,7 +198,7 @@ def plot() -> None:
             mean = sum(last) / len(last)
             print(f'{name}: {mean:.0f} at step {steps[-1]}, seeds {[round(x) for x in last]}')
     axes.set(xlabel='environment steps', ylabel=f'true return, {EPISODES} deterministic episodes')
-    axes.set_title(f'SAC with the true reward on {TASK}: mean, lowest and highest seed')
+    axes.set_title(f'SAC with the true reward on {TASK}:\nmean, lowest and highest seed')
     axes.legend()
     axes.grid(alpha=0.3)
     figure.savefig(RESULTS / 'learning_curves.png', dpi=120)
