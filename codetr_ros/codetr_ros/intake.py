@@ -4,6 +4,7 @@ what a commit names.
 
 import logging
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,8 @@ class Tasks:
         self._run = run
         self._expected = settings.simulators
         self.specs: dict[str, TaskSpec] = {}
+        self._unannounced: list[Transitions] = []
+        self.refused: Counter[str] = Counter()  # of what waited for its announcement
 
     @property
     def known(self) -> bool:
@@ -93,6 +96,39 @@ class Tasks:
                 f'({", ".join(self.sources)}). Start the run with more, or stop this one'
             )
         self.specs[spec.source] = spec
+
+    def announce(self, spec: TaskSpec, receive: Callable[[Transitions], None]) -> None:
+        """Take an announcement, then hand what waited for it to `receive`.
+
+        Raises:
+            RecordError: as `receive` of this class; what waited is then still waiting.
+        """
+        self.receive(spec)
+        waiting, self._unannounced = self._unannounced, []
+        for chunk in waiting:
+            try:
+                receive(chunk)
+            except RecordError as error:  # its fault, not that of the announcement
+                self.refused[TOPICS[Transitions]] += 1
+                _log.error('%s', error)
+
+    def admit(self, chunk: Transitions) -> bool:
+        """Whether steps may be taken in now; those that came before their announcement wait.
+
+        Raises:
+            RecordError: they are of no simulator of this run, or the task cannot have them.
+        """
+        spec = self.specs.get(chunk.source)
+        if spec is not None:
+            check_transitions(chunk, spec)
+            return True
+        if self.known:
+            raise RecordError(
+                f'{describe(chunk)}: {chunk.source!r} is no simulator of this run; these are: '
+                f'{", ".join(self.sources)}'
+            )
+        self._unannounced.append(chunk)  # announcements travel on another topic
+        return False
 
 
 def check_transitions(chunk: Transitions, spec: TaskSpec) -> None:
@@ -165,14 +201,13 @@ class Intake:
         self._transitions: dict[tuple[str, int], Transitions] = {}
         self._rewards: dict[tuple[str, int], CompositeReward] = {}
         self._true: dict[tuple[str, int], TrueRewards] = {}
-        self._unchecked: list[Transitions] = []
         self._commits: dict[int, Commit] = {}
         self._taken = {
             'transitions': Counter[str](),
             'scores': Counter[str](),
         }  # next sequence number due
         self.duplicated: Counter[str] = Counter()
-        self.refused: Counter[str] = Counter()
+        self.refused = self.tasks.refused
         self.missing: int | None = None  # a committed phase of which something has not arrived
 
     def receive(self, record: Record) -> None:
@@ -183,16 +218,11 @@ class Intake:
         """
         check_run(record, self._run)
         if isinstance(record, TaskSpec):
-            self.tasks.receive(record)
-            waiting, self._unchecked = self._unchecked, []
-            for chunk in waiting:
-                try:
-                    self.receive(chunk)
-                except RecordError as error:  # its fault, not that of the announcement
-                    self.refused[TOPICS[Transitions]] += 1
-                    _log.error('%s', error)
+            self.tasks.announce(record, self.receive)
         elif isinstance(record, Transitions):
-            self._receive_transitions(record)
+            if self.tasks.admit(record):
+                key = (record.source, record.sequence)
+                self._hold(record, self._transitions, key, self._taken['transitions'])
         elif isinstance(record, CompositeReward):
             check_score(record, self._settings.delay)
             self._hold(
@@ -202,23 +232,6 @@ class Intake:
             self._true[record.source, record.sequence] = record
         elif isinstance(record, Commit):
             self._commits.setdefault(record.phase, record)
-
-    def _receive_transitions(self, chunk: Transitions) -> None:
-        spec = self.tasks.specs.get(chunk.source)
-        if spec is None:
-            if self.tasks.known:
-                raise RecordError(
-                    f'{describe(chunk)}: {chunk.source!r} is no simulator of this run; these are: '
-                    f'{", ".join(self.tasks.sources)}'
-                )
-            self._unchecked.append(
-                chunk
-            )  # its announcement travels on another topic and may come later
-            return
-        check_transitions(chunk, spec)
-        self._hold(
-            chunk, self._transitions, (chunk.source, chunk.sequence), self._taken['transitions']
-        )
 
     def _hold(
         self,

@@ -4,7 +4,6 @@ The core knows nothing of bags. Whoever wires it writes everything it has been g
 passing a `Commit` on: what a node learns from is then never lost.
 """
 
-import logging
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from codetr_ros.config import Settings
-from codetr_ros.intake import Tasks, check_run, check_score, check_transitions
+from codetr_ros.intake import Tasks, check_run, check_score
 from codetr_ros.records import (
     TOPICS,
     Commit,
@@ -27,8 +26,6 @@ from codetr_ros.records import (
     describe,
     metrics,
 )
-
-_log = logging.getLogger(__name__)
 
 
 class Recorder:
@@ -53,9 +50,8 @@ class Recorder:
         self._transitions: Counter[str] = Counter()  # next sequence number of each source
         self._scores: Counter[str] = Counter()  # next sequence number of each scorer
         self._committed_scores: Counter[str] = Counter()
-        self._unchecked: list[Transitions] = []
         self.duplicated: Counter[str] = Counter()
-        self.refused: Counter[str] = Counter()
+        self.refused = self._tasks.refused
         self.finished = False
         self.phase = 0  # the next to be committed
 
@@ -68,14 +64,7 @@ class Recorder:
         """
         check_run(record, self._run)
         if isinstance(record, TaskSpec):
-            self._tasks.receive(record)
-            waiting, self._unchecked = self._unchecked, []
-            for chunk in waiting:
-                try:
-                    self.receive(chunk)
-                except RecordError as error:  # its fault, not that of the announcement
-                    self.refused[TOPICS[Transitions]] += 1
-                    _log.error('%s', error)
+            self._tasks.announce(record, self.receive)
         elif isinstance(record, Policy):
             due, given = self._settings.steps_of(record.phase), int(record.steps.sum())
             if record.phase < self.phase or given != due:
@@ -86,16 +75,7 @@ class Recorder:
             steps = dict(zip(record.sources, record.steps.tolist(), strict=True))
             self._permitted[record.phase] = {source: n for source, n in steps.items() if n}
         elif isinstance(record, Transitions):
-            spec = self._tasks.specs.get(record.source)
-            if spec is None and self._tasks.known:
-                raise RecordError(
-                    f'{describe(record)}: {record.source!r} is no simulator of this run'
-                )
-            if spec is None:  # its announcement travels on another topic and may come later
-                self._unchecked.append(record)
-                return
-            check_transitions(record, spec)
-            if self._next(record, self._transitions, record.source):
+            if self._tasks.admit(record) and self._next(record, self._transitions, record.source):
                 self._steps[record.phase, record.source] += record.steps
                 if record.phase_end:
                     self._ended[record.phase, record.source] = (record.sequence, record.scores_due)
