@@ -1,0 +1,46 @@
+"""How well inferred step rewards agree with the true ones, and predictions with scores.
+
+A correlation, or R^2, is NaN where one side does not vary: there is nothing to explain then.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+
+
+def r_squared(predicted: ArrayLike, true: ArrayLike) -> float:
+    """The part of the variance of `true` that `predicted` explains: 1 - residual / total."""
+    expected = np.asarray(true, np.float64)
+    residual = np.asarray(predicted, np.float64) - expected
+    if not len(expected):
+        return float('nan')
+    total = float(((expected - expected.mean()) ** 2).sum())
+    return 1 - float((residual**2).sum()) / total if total > 0 else float('nan')
+
+
+def step_recovery(
+    labels: ArrayLike, true: ArrayLike, inside: NDArray[np.bool_]
+) -> dict[str, float]:
+    """Correlations of inferred and true step rewards, pooled over segments.
+
+    Args:
+        labels: inferred step rewards (B, L).
+        true: the environment's own (B, L).
+        inside: which steps (B, L) are their segments' own: neither context nor padding.
+
+    Returns:
+        `pearson` and `spearman` over all steps; `within_pearson` and `within_spearman` after each
+        segment's mean was taken from both: is credit right inside the segment?
+    """
+    pair = [np.where(inside, np.asarray(x, np.float64), 0.0) for x in (labels, true)]
+    n = np.maximum(inside.sum(1, keepdims=True), 1)
+    centred = [x - x.sum(1, keepdims=True) / n for x in pair]
+    # what rounding leaves of a constant from which its mean was taken is no variation
+    least = [1e-9 * float(np.abs(x).max(initial=0)) for x in pair]
+    found = {}
+    for prefix, sides in (('', pair), ('within_', centred)):
+        a, b = (side[inside] for side in sides)
+        varies = len(a) > 1 and np.ptp(a) > least[0] and np.ptp(b) > least[1]
+        for name, measure in (('pearson', stats.pearsonr), ('spearman', stats.spearmanr)):
+            found[prefix + name] = float(measure(a, b).statistic) if varies else float('nan')
+    return found
