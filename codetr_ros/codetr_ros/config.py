@@ -24,6 +24,9 @@ Composite = Literal[
 Method = Literal['codetr', 'none', 'uniform', 'true', 'ones']
 IN_PROCESS_ONLY: tuple[str, ...] = ('true', 'ones')
 """Reference methods: they look at what no node may see (`true`) or ignore the scores (`ones`)."""
+SCORE_LEARNERS: tuple[str, ...] = ()
+"""Methods whose policy learner learns from the composite rewards themselves: no reward node labels
+steps for it."""
 PRESETS = ('quick', 'cpu', 'paper')
 
 
@@ -231,6 +234,23 @@ class Settings(Group):
         default_factory=CodetrSettings, description='the reward transformer'
     )
     sac: SacSettings = Field(default_factory=SacSettings, description='the policy learner')
+
+    @property
+    def labels_steps(self) -> bool:
+        """Whether a reward method labels steps, from which the policy is then learnt."""
+        return self.method not in SCORE_LEARNERS
+
+    @property
+    def roles(self) -> dict[str, int]:
+        """How many nodes of each role the run needs."""
+        needed = {
+            'sim': self.simulators,
+            'evaluate': int(self.evaluate_every > 0),
+            'reward': int(self.labels_steps),
+            'record': 1,
+            'learner': 1,
+        }
+        return {role: count for role, count in needed.items() if count}
 
     @property
     def phases(self) -> int:

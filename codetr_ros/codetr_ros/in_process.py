@@ -80,7 +80,8 @@ def run(
         name: ('sim', Simulator(spec, settings, name)) for name in settings.sources
     }
     cores['record'] = ('record', Recorder(spec, settings, 'record'))
-    cores['reward'] = ('reward', Labeller(spec, settings, 'reward', checkpoints))
+    if settings.labels_steps:
+        cores['reward'] = ('reward', Labeller(spec, settings, 'reward', checkpoints))
     cores['learner'] = ('learner', Learner(spec, settings, 'learner', checkpoints))
     cores['evaluate'] = ('evaluate', Evaluator(spec, settings, 'evaluate'))
     published: dict[str, Counter[str]] = {name: Counter() for name in cores}

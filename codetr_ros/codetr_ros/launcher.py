@@ -83,9 +83,7 @@ def commands(
         LaunchError: an executable is missing.
     """
     nodes = [(name, 'sim') for name in settings.sources]
-    if settings.evaluate_every > 0:
-        nodes.append(('evaluate', 'evaluate'))
-    nodes += [('reward', 'reward'), ('record', 'record'), ('learner', 'learner')]
+    nodes += [(role, role) for role in settings.roles if role != 'sim']
     found = []
     for name, role in nodes:
         arguments = [str(executable(role, environ)), '--ros-args', '-r', f'__ns:=/run_{run_id}']

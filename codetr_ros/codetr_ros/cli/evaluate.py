@@ -77,8 +77,7 @@ def newest_policy(folder: Path, settings: Settings) -> Policy:
         CheckpointError: the checkpoint is damaged.
     """
     from codetr_ros import checkpoints
-    from codetr_ros.learners import network
-    from codetr_ros.learners.sac import SAC
+    from codetr_ros.learners import methods, network
 
     place = folder / run_folder.CHECKPOINTS
     path = checkpoints.latest(place, 'learner')
@@ -94,9 +93,8 @@ def newest_policy(folder: Path, settings: Settings) -> Policy:
             f'{path} is from the warm-up ({settings.warmup_steps} steps): '
             'its policy has learnt nothing yet'
         )
-    sizes = meta['observation_size'], meta['action_size']
-    sac = SAC(*sizes, settings.sac, settings.seed)
-    sac.load_state({name: t for name, t in tensors.items() if not name.startswith('labels/')})
+    learner = methods.make(settings, meta['observation_size'], meta['action_size'])
+    learner.load_state({name: t for name, t in tensors.items() if not name.startswith('labels/')})
     return Policy(
         run_id='evaluate',
         phase=phase + settings.lag,
@@ -104,8 +102,8 @@ def newest_policy(folder: Path, settings: Settings) -> Policy:
         sources=(),
         steps=np.zeros(0, np.uint32),
         random=False,
-        network=network.describe(*sizes, settings.sac.hidden),
-        weights=network.weights_bytes(sac.actor),
+        network=learner.network,
+        weights=network.weights_bytes(learner.actor),
     )
 
 

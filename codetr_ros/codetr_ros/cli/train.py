@@ -79,7 +79,7 @@ def main(arguments: Sequence[str]) -> int:
             )
         tasks.check(settings, tasks.find(settings.task))
         if not in_process:
-            for role in launcher.EXECUTABLES:
+            for role in settings.roles:
                 launcher.executable(role)
         stamp = time.strftime('%Y%m%d-%H%M%S')
         folder = run_folder.create(Path(extra['out'] or default_out(settings, stamp)))

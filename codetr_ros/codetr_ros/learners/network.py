@@ -78,8 +78,8 @@ def linear_layers(actor: Actor) -> list[nn.Linear]:
     return [layer for layer in actor.modules() if isinstance(layer, nn.Linear)]
 
 
-def weights_bytes(actor: Actor) -> bytes:
-    """The weights as safetensors: the same weights give the same bytes."""
+def weights_bytes(actor: nn.Module) -> bytes:
+    """The weights of a policy network as safetensors: the same weights give the same bytes."""
     return safetensors.torch.save(actor.state_dict())
 
 

@@ -14,7 +14,7 @@ from codetr_ros.ros.errors import NodeError
 from codetr_ros.ros.fetch import Fetcher
 from codetr_ros.ros.member import Member
 from codetr_ros.ros.patience import NAME_EVERY
-from codetr_ros.ros.peers import READERS, WRITERS, needed, published_by
+from codetr_ros.ros.peers import WRITERS, published_by, readers
 
 IDLE = 0.05  # [s] blocked in the executor while there is nothing to do: the longest a signal waits
 NAME_PATIENCE = 2.0  # [s] for the name of a node whose topics are known
@@ -31,6 +31,19 @@ def refuse_reference(who: str, settings: Settings) -> None:
             f'{who}: method = {settings.method!r} is a reference that runs in process only: use '
             f'`codetr train --in-process --method {settings.method}`, or start the learner with '
             f'another method'
+        )
+
+
+def refuse_idle_reward(who: str, role: str, settings: Settings) -> None:
+    """Refuse a reward node where nobody wants step rewards.
+
+    Raises:
+        NodeError: the policy is learnt from the scores themselves.
+    """
+    if role == 'reward' and role not in settings.roles:
+        raise NodeError(
+            f'{who}: method = {settings.method!r} learns from the scores in the learner and needs '
+            'no reward node: stop this one, or start the learner with another method'
         )
 
 
@@ -118,6 +131,7 @@ class Joining(Member):
                 self.run_spec.settings, f'run {self.run_spec.run_id!r} of {owner}'
             )
             refuse_reference(self.link.full_name, self.settings)
+            refuse_idle_reward(self.link.full_name, self.role, self.settings)
             parameters.check_against_run(node, self.settings, owner)
         parameters.declare_settings(node, self.settings)
         self._tell()
@@ -165,14 +179,15 @@ class Joining(Member):
         absent = self.peers.absent(self.settings, self.run_spec.settings_hash)
         if absent:
             return absent
-        reads = [topic for topic, roles in READERS.items() if self.role in roles]
+        reading = readers(self.settings)
+        reads = [topic for topic, roles in reading.items() if self.role in roles]
         return self.link.unmatched(
-            published_by(self.role), self._names(READERS), readers=True
+            published_by(self.role), self._names(reading), readers=True
         ) + self.link.unmatched(reads, self._names(WRITERS), readers=False)
 
     def _names(self, table: dict[str, tuple[str, ...]]) -> Callable[[str], set[str]]:
         assert self.settings is not None
-        roles = set(needed(self.settings))
+        roles = set(self.settings.roles)
 
         def names(topic: str) -> set[str]:
             wanted = [role for role in table[topic] if role in roles]

@@ -26,7 +26,7 @@ READERS: dict[str, tuple[str, ...]] = {
     'true_rewards': ('record',),
     'metrics': ('record',),
 }
-"""Roles that must read what is published on a topic."""
+"""Roles that must read what is published on a topic, where a reward node labels steps."""
 WRITERS: dict[str, tuple[str, ...]] = {
     'run': ('learner',),
     'task': ('sim',),
@@ -50,10 +50,14 @@ COMMANDS = {
 """What starts a node of a role, for errors."""
 
 
-def needed(settings: Settings) -> dict[str, int]:
-    """How many nodes of each role a run needs."""
-    roles = {'sim': settings.simulators, 'reward': 1, 'learner': 1, 'record': 1}
-    return roles | ({'evaluate': 1} if settings.evaluate_every else {})
+def readers(settings: Settings) -> dict[str, tuple[str, ...]]:
+    """Roles that must read what is published on a topic in a run with these settings."""
+    if settings.labels_steps:
+        return READERS
+    return READERS | {
+        'composite_rewards': (*READERS['composite_rewards'], 'learner'),
+        'step_rewards': ('record',),
+    }
 
 
 def published_by(role: str) -> tuple[str, ...]:
@@ -115,7 +119,7 @@ class Peers:
         them.
         """
         missing = []
-        for role, count in needed(settings).items():
+        for role, count in settings.roles.items():
             there = [p for p in self.alive(role) if not p.said.finished]
             ready = [p for p in there if p.said.settings_hash == settings_hash]
             have = len(ready) + (role == self.role)

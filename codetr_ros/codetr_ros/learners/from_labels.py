@@ -1,0 +1,52 @@
+"""SAC on the inferred step rewards: the policy learner of every method that labels steps."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from torch import Tensor
+
+from codetr_ros.config import Settings
+from codetr_ros.learners import network
+from codetr_ros.learners.learner import OffPolicy
+from codetr_ros.learners.sac import SAC
+from codetr_ros.trajectories import Trajectories
+
+
+class FromLabels(OffPolicy):
+    """Soft actor-critic that draws labelled steps.
+
+    Args:
+        settings: the run's settings.
+        observation_size: O of the task.
+        action_size: A of the task.
+    """
+
+    lacking = 'nothing labelled'
+
+    def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
+        super().__init__(settings)
+        self._sac = SAC(observation_size, action_size, settings.sac, settings.seed)
+        self.network = network.describe(observation_size, action_size, settings.sac.hidden)
+
+    @property
+    def actor(self) -> network.Actor:
+        """The policy network."""
+        return self._sac.actor
+
+    def _prepare(self, memory: Trajectories) -> bool:
+        return memory.labelled_steps > 0
+
+    def _update(self, memory: Trajectories, rng: np.random.Generator) -> dict[str, Tensor]:
+        return self._sac.update(memory.sample_steps(rng, self._settings.sac.batch))
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that it takes to go on from here, in copies."""
+        return self._sac.state()
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Go on from a `state()`.
+
+        Raises:
+            SacError: it is of another architecture; nothing has changed then.
+        """
+        self._sac.load_state(dict(state))

@@ -1,0 +1,23 @@
+"""Policy learners: SAC on step rewards, and the methods that learn from the scores themselves."""
+
+from collections.abc import Callable
+
+from codetr_ros.config import Settings
+from codetr_ros.learners.from_labels import FromLabels
+from codetr_ros.learners.learner import PolicyLearner
+
+METHODS: dict[str, Callable[[Settings, int, int], PolicyLearner]] = {}
+"""Policy learners by the name that `settings.method` gives them. Every other method is one of
+rewards: it labels steps, and SAC learns from the labels."""
+
+
+def make(settings: Settings, observation_size: int, action_size: int) -> PolicyLearner:
+    """Make the policy learner that the settings ask for.
+
+    Args:
+        settings: the run's settings.
+        observation_size: O of the task.
+        action_size: A of the task.
+    """
+    learner = METHODS.get(settings.method, FromLabels)
+    return learner(settings, observation_size, action_size)
