@@ -12,7 +12,9 @@ from rclpy.serialization import serialize_message
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from codetr_ros.bags.writer import BagError, BagTopic, McapWriter, schema_text, type_hash
+from codetr_ros.bags.errors import BagError
+from codetr_ros.bags.topics import BagTopic, schema_text, type_hash
+from codetr_ros.bags.writer import McapWriter
 from codetr_ros.ros import messages
 
 TRANSITIONS = BagTopic('/r/transitions', 'codetr_msgs/msg/Transitions', 100, False)

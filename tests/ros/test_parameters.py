@@ -100,7 +100,14 @@ def test_a_parameter_that_contradicts_the_run_is_refused_naming_both_values_and_
 
 def test_own_parameters_have_types_and_ranges(make_node):
     values = parameters.declare_own(make_node(run_id=5, peer_deadline=3), 'record')
-    assert values == {'run_id': '5', 'folder': '', 'peer_deadline': 3.0, 'bag': ''}
+    assert values == {
+        'run_id': '5',
+        'folder': '',
+        'peer_deadline': 3.0,
+        'bag': '',
+        'bag_split_mb': 1000.0,
+        'bag_keep_free_mb': 64.0,
+    }
     with pytest.raises(
         parameters.ParameterError, match='peer_deadline = -1 must be a number from 0'
     ):

@@ -11,7 +11,7 @@ from builders import tiny
 from ros.playing import output, process
 
 from codetr_ros import middleware, run_folder
-from codetr_ros.bags.writer import BagError
+from codetr_ros.bags.errors import BagError
 from codetr_ros.checkpoints import CheckpointError
 from codetr_ros.composite import CompositeError
 from codetr_ros.config import SettingsError, load

@@ -1,146 +1,36 @@
 """Writes a bag that loses nothing which was flushed: MCAP in small chunks, each with its CRC.
 
-A bag is a folder of MCAP files and a `metadata.yaml` (rosbag2's version 9), written last. The
-layout is rosbag2's: profile `ros2`, schemas as .msg text with all that they contain,
-`offered_qos_profiles` and `topic_type_hash` at each channel. A process that is killed leaves a
-file without index and a folder without metadata: every flushed message can still be read from it
-in order (`mcap.stream_reader`).
+A bag is a folder of MCAP files and a `metadata.yaml`, written last. The layout is rosbag2's:
+profile `ros2`, schemas as .msg text with all that they contain, `offered_qos_profiles` and
+`topic_type_hash` at each channel. A file that has reached a size is finished, index included, and
+the next one begun. A process that is killed leaves its last file without index and the folder
+without metadata (so that no reader takes the bag for whole): every flushed message can still be
+read from it in order (`mcap.stream_reader`).
 
 Messages are taken as the CDR bytes that came: nothing is decoded, so nothing can change.
 """
 
-import json
 import os
-import sys
+import shutil
 from collections import Counter
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import yaml
 from mcap.writer import CompressionType, Writer
 
+from codetr_ros.bags.errors import BagError
+from codetr_ros.bags.metadata import METADATA, BagFile, render
+from codetr_ros.bags.topics import BagTopic, schema_text, type_hash
 from codetr_ros.run_folder import atomic_write, sync_folder
 
 CHUNK_BYTES = 64 * 1024
 """Size at which a chunk is closed by itself: what a killed process can lose of messages not yet
 flushed."""
-METADATA = 'metadata.yaml'
-_FOREVER = {'sec': 9223372036, 'nsec': 854775807}
-
-
-class BagError(RuntimeError):
-    """A bag that cannot be written or set up: names the file or the type, the reason and the
-    remedy.
-    """
-
-
-@dataclass(frozen=True)
-class BagTopic:
-    """A topic as the bag describes it."""
-
-    name: str  # fully resolved, such as /run/transitions
-    type: str  # such as codetr_msgs/msg/Transitions
-    depth: int
-    transient_local: bool
-
-    def qos(self) -> list[dict[str, Any]]:
-        """The QoS it was offered with, as rosbag2 writes it (so that `ros2 bag play` offers the
-        same).
-        """
-        return [
-            {
-                'history': 'keep_last',
-                'depth': self.depth,
-                'reliability': 'reliable',
-                'durability': 'transient_local' if self.transient_local else 'volatile',
-                'deadline': dict(_FOREVER),
-                'lifespan': dict(_FOREVER),
-                'liveliness': 'automatic',
-                'liveliness_lease_duration': dict(_FOREVER),
-                'avoid_ros_namespace_conventions': False,
-            }
-        ]
-
-
-@cache
-def _share_folders() -> tuple[Path, ...]:
-    prefixes = [p for p in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]
-    return tuple(Path(prefix) / 'share' for prefix in (*prefixes, sys.prefix))
-
-
-def _interface_file(package: str, name: str, suffix: str) -> Path:
-    for share in _share_folders():
-        path = share / package / 'msg' / f'{name}.{suffix}'
-        if path.is_file():
-            return path
-    searched = ', '.join(str(share) for share in _share_folders())
-    raise BagError(
-        f'no {suffix} file of {package}/msg/{name} in {searched}: build the workspace, or '
-        f'source its setup file'
-    )
-
-
-def _contained(package: str, text: str) -> Iterable[tuple[str, str]]:
-    """Message types that a .msg text names as field types, in order."""
-    for line in text.splitlines():
-        kind = line.split('#', 1)[0].split(' ', 1)[0].split('[', 1)[0].split('<', 1)[0].strip()
-        if '/' in kind:
-            owner, _, name = kind.partition('/')
-            yield owner, name.removeprefix('msg/')
-        elif kind[:1].isupper():
-            yield package, kind
-
-
-@cache
-def schema_text(type_name: str) -> bytes:
-    """The definition of a message type and of all that it contains, in rosbag2's form.
-
-    Raises:
-        BagError: its .msg file is not installed.
-    """
-    package, _, name = type_name.split('/')
-    text = _interface_file(package, name, 'msg').read_text()
-    parts = [text]
-    seen = {(package, name)}
-    todo = list(_contained(package, text))
-    while todo:
-        key = todo.pop(0)
-        if key in seen:
-            continue
-        seen.add(key)
-        text = _interface_file(*key, 'msg').read_text()
-        parts.append(f'\n{"=" * 80}\nMSG: {key[0]}/{key[1]}\n{text}')
-        todo = [*_contained(key[0], text), *todo]
-    return ''.join(parts).encode()
-
-
-@cache
-def type_hash(type_name: str) -> str:
-    """REP-2016 hash of a message type (`RIHS01_...`), from its installed description.
-
-    Raises:
-        BagError: the description is not installed or does not name the type.
-    """
-    package, _, name = type_name.split('/')
-    path = _interface_file(package, name, 'json')
-    for entry in json.loads(path.read_text())['type_hashes']:
-        if entry['type_name'] == type_name:
-            return str(entry['hash_string'])
-    raise BagError(f'{path} has no hash of {type_name}: build the workspace again')
-
-
-@dataclass
-class _FileInfo:
-    """What metadata.yaml says about one file."""
-
-    name: str
-    start: int = 0
-    end: int = 0
-    count: int = 0
+SPLIT_BYTES = 10**9
+"""Size at which the next file is begun."""
 
 
 class McapWriter:
@@ -150,21 +40,32 @@ class McapWriter:
         folder: the bag; must not exist, or be empty.
         topics: what will be written.
         chunk_bytes: size at which a chunk is closed.
+        split_bytes: size at which the next file is begun; 0: never.
+        keep_free: `check_room` complains when the disk has fewer bytes left.
 
     Raises:
         BagError: the folder holds something or cannot be made, or a type is not installed.
     """
 
     def __init__(
-        self, folder: Path, topics: Iterable[BagTopic], chunk_bytes: int = CHUNK_BYTES
+        self,
+        folder: Path,
+        topics: Iterable[BagTopic],
+        chunk_bytes: int = CHUNK_BYTES,
+        split_bytes: int = SPLIT_BYTES,
+        keep_free: int = 0,
     ) -> None:
         self.folder = folder
         self.counts: Counter[str] = Counter()
+        self.closed = False
         self._topics = {topic.name: topic for topic in topics}
         self._chunk_bytes = chunk_bytes
-        self._files: list[_FileInfo] = []
-        self._good = 0
-        self.closed = False
+        self._split_bytes = split_bytes
+        self._keep_free = keep_free
+        self._files: list[BagFile] = []
+        self._finished = 0  # bytes of the files that are finished
+        self._path: Path | None = None  # of the file that is not
+        self._good = 0  # bytes of it that are on the disk and whole
         try:
             folder.mkdir(parents=True, exist_ok=True)
             if found := sorted(p.name for p in folder.iterdir()):
@@ -173,7 +74,6 @@ class McapWriter:
                     f'remove it'
                 )
             self._open_file()
-            sync_folder(folder)
         except OSError as error:
             raise BagError(
                 f'bag {folder} cannot be made: {error.strerror}; choose another folder'
@@ -182,15 +82,22 @@ class McapWriter:
     @property
     def size(self) -> int:
         """Bytes written so far."""
-        return self._good if self._stream.closed else self._stream.tell()
+        return self._finished + (self._good if self._stream.closed else self._stream.tell())
 
     def _open_file(self) -> None:
         """Begin the bag's next file. Schemas and channels are written to each, so that each can be
         read alone.
         """
-        info = _FileInfo(f'{self.folder.name}_{len(self._files)}.mcap')
-        self._stream = (self.folder / info.name).open('xb')
-        self._files.append(info)
+        file = BagFile(f'{self.folder.name}_{len(self._files)}.mcap')
+        # worked out first: a type that is missing leaves no file behind
+        described = [
+            (topic, schema_text(topic.type), type_hash(topic.type))
+            for topic in self._topics.values()
+        ]
+        path = self.folder / file.name
+        self._stream = path.open('xb')
+        self._path = path
+        self._files.append(file)
         self._writer: Any = Writer(  # its methods carry no types
             self._stream,
             chunk_size=self._chunk_bytes,
@@ -200,21 +107,20 @@ class McapWriter:
         self._writer.start(profile='ros2', library='codetr_ros')
         self._channels: dict[str, int] = {}
         schemas: dict[str, int] = {}
-        for topic in self._topics.values():
+        for topic, text, digest in described:
             if topic.type not in schemas:
-                schemas[topic.type] = self._writer.register_schema(
-                    topic.type, 'ros2msg', schema_text(topic.type)
-                )
+                schemas[topic.type] = self._writer.register_schema(topic.type, 'ros2msg', text)
             self._channels[topic.name] = self._writer.register_channel(
                 topic.name,
                 'cdr',
                 schemas[topic.type],
                 {
                     'offered_qos_profiles': yaml.safe_dump(topic.qos(), sort_keys=False),
-                    'topic_type_hash': type_hash(topic.type),
+                    'topic_type_hash': digest,
                 },
             )
-        self._flush()
+        self._sync()
+        sync_folder(self.folder)
 
     def write(
         self, topic: str, data: bytes, log_time: int, publish_time: int | None = None
@@ -231,19 +137,21 @@ class McapWriter:
             BagError: it cannot be written. The bag is then closed, and holds what had been
                 flushed.
         """
-        info = self._files[-1]
+        if self.closed:
+            raise BagError(f'bag {self.folder} is closed: nothing can be written to it any more')
         try:
+            if 0 < self._split_bytes <= self._stream.tell():
+                self._finish_file()
+                self._open_file()
             self._writer.add_message(
                 self._channels[topic], log_time, data, publish_time or log_time, self.counts[topic]
             )
         except OSError as error:
             raise self._broken(error) from error
         self.counts[topic] += 1
-        info.start = min(info.start, log_time) if info.count else log_time
-        info.end = max(info.end, log_time)
-        info.count += 1
+        self._files[-1].add(topic, log_time)
 
-    def _flush(self) -> None:
+    def _sync(self) -> None:
         self._writer.flush()
         self._stream.flush()
         os.fsync(self._stream.fileno())
@@ -257,25 +165,52 @@ class McapWriter:
                 before.
         """
         try:
-            self._flush()
+            self._sync()
         except OSError as error:
             raise self._broken(error) from error
+
+    def check_room(self) -> None:
+        """Complain while the bag can still be closed as it should be.
+
+        Raises:
+            BagError: the disk has less room left than was to be kept. The bag is as it was.
+        """
+        free = shutil.disk_usage(self.folder).free
+        if free < self._keep_free:
+            raise BagError(
+                f'bag {self.folder}: the disk has {free / 1e6:.0f} MB left, fewer than the '
+                f'{self._keep_free / 1e6:.0f} MB to be kept free: make room, and start the run '
+                f'again in another folder'
+            )
+
+    def _finish_file(self) -> None:
+        """Write the file's index."""
+        self._sync()
+        self._writer.finish()
+        self._stream.flush()
+        os.fsync(self._stream.fileno())
+        self._finished += self._stream.tell()
+        self._stream.close()
+        self._path, self._good = None, 0
 
     def _broken(self, error: OSError) -> BagError:
         """Cut the file back to the last whole chunk: half a chunk would spoil what comes before it
         for some readers.
         """
         self.closed = True
-        path = self.folder / self._files[-1].name
         with suppress(
             OSError
         ):  # closing tries to write the buffer once more; the file is closed all the same
             self._stream.close()
-        os.truncate(path, self._good)
+        if self._path is not None and self._good:
+            os.truncate(self._path, self._good)
+        elif self._path is not None:  # not even its beginning is on the disk
+            self._path.unlink()
         return BagError(
-            f'bag {path} cannot be written: {error.strerror}. It holds the {self._good} bytes '
-            f'flushed before, '
-            f'without an index. Make room, and start the run again in another folder'
+            f'bag {self._path or self.folder} cannot be written: {error.strerror}. It holds the '
+            f'{self.size} bytes flushed before, the last file without an index: make room, '
+            f'`codetr bag recover {self.folder}` makes it whole; start the run again in another '
+            f'folder'
         )
 
     def close(self) -> None:
@@ -287,60 +222,14 @@ class McapWriter:
         if self.closed:
             return
         try:
-            self._flush()
-            self._writer.finish()
-            self._stream.flush()
-            os.fsync(self._stream.fileno())
-            self._good = self._stream.tell()
-            self._stream.close()
-            atomic_write(self.folder / METADATA, self._metadata())
-            self.closed = True
+            self._finish_file()
         except OSError as error:
-            if not self._stream.closed:
-                raise self._broken(error) from error
+            raise self._broken(error) from error
+        self.closed = True
+        try:
+            atomic_write(self.folder / METADATA, render(self._files, self._topics.values()))
+        except OSError as error:
             raise BagError(
                 f'bag {self.folder} is whole but {METADATA} cannot be written: '
-                f'{error.strerror}; make room and reindex it'
+                f'{error.strerror}; make room, `codetr bag recover {self.folder}` writes it'
             ) from error
-
-    def _metadata(self) -> str:
-        files = [
-            {
-                'path': info.name,
-                'starting_time': {'nanoseconds_since_epoch': info.start},
-                'duration': {'nanoseconds': info.end - info.start},
-                'message_count': info.count,
-            }
-            for info in self._files
-        ]
-        used = [info for info in self._files if info.count]
-        start = min((info.start for info in used), default=0)
-        end = max((info.end for info in used), default=0)
-        topics = [
-            {
-                'topic_metadata': {
-                    'name': topic.name,
-                    'type': topic.type,
-                    'serialization_format': 'cdr',
-                    'offered_qos_profiles': topic.qos(),
-                    'type_description_hash': type_hash(topic.type),
-                },
-                'message_count': self.counts[topic.name],
-            }
-            for topic in self._topics.values()
-        ]
-        information = {
-            'version': 9,
-            'storage_identifier': 'mcap',
-            'duration': {'nanoseconds': end - start},
-            'starting_time': {'nanoseconds_since_epoch': start},
-            'message_count': sum(info.count for info in self._files),
-            'topics_with_message_count': topics,
-            'compression_format': '',
-            'compression_mode': '',
-            'relative_file_paths': [info.name for info in self._files],
-            'files': files,
-            'custom_data': None,
-            'ros_distro': os.environ.get('ROS_DISTRO', 'jazzy'),
-        }
-        return yaml.safe_dump({'rosbag2_bagfile_information': information}, sort_keys=False)

@@ -90,13 +90,18 @@ class Link:
                     message_type, topic, qos.profile(topic, settings)
                 )
 
-    def publish(self, record: Record) -> Any:
-        """Publish a record on its topic and count it; returns the message."""
-        topic = TOPICS[type(record)]
-        message = messages.to_message(record, self.node.get_clock().now().to_msg())
+    def publish(self, record: Record) -> None:
+        """Publish a record on its topic and count it."""
+        self.send(TOPICS[type(record)], self.message(record))
+
+    def message(self, record: Record) -> Any:
+        """The message of a record, stamped with the time of now."""
+        return messages.to_message(record, self.node.get_clock().now().to_msg())
+
+    def send(self, topic: str, message: Any) -> None:
+        """Publish a message, or its CDR bytes, and count it."""
         self._publishers[topic].publish(message)
         self.published[topic] += 1
-        return message
 
     def diagnose(self, level: bytes, message: str, counters: dict[str, dict[str, int]]) -> None:
         """Say on /diagnostics how messages fare."""

@@ -75,6 +75,17 @@ OWN_OF_ROLE: dict[str, dict[str, Own]] = {
             'folder of the bag; empty: `bag` in `folder`, or where that is empty too no bag at '
             'all',
         ),
+        'bag_split_mb': Own(
+            1000.0,
+            'megabytes after which the bag goes on in its next file; 0: never',
+            high=1e6,
+        ),
+        'bag_keep_free_mb': Own(
+            64.0,
+            'megabytes of the disk to leave free: with fewer left, the bag is closed and the run '
+            'ends, while there is room for its index; 0: go on until the disk is full',
+            high=1e6,
+        ),
     },
 }
 

@@ -1,9 +1,11 @@
 """The recorder's wiring: writes what arrives as it came, and commits phases.
 
 Everything of the run is appended to the bag as received bytes before the core sees it, sound or
-not, and the bag is flushed and synced before a commit goes out: nobody learns from what could be
-lost. What belongs to another run is refused and not recorded. The last phases are kept in memory
-too, and the service `fetch_phase` sends one of them again.
+not. A commit goes into the bag after all that it names, and out to the nodes only when the bag is
+flushed and synced: nobody learns from what could be lost, and the bag says of every phase that
+anybody has learnt from what belongs to it. What belongs to another run is refused and not
+recorded. The last phases are kept in memory too, and the service `fetch_phase` sends one of them
+again.
 """
 
 import time
@@ -18,7 +20,8 @@ from codetr_msgs.srv import FetchPhase
 from rclpy.serialization import deserialize_message, serialize_message
 
 from codetr_ros import run_folder
-from codetr_ros.bags.writer import BagTopic, McapWriter
+from codetr_ros.bags.topics import BagTopic
+from codetr_ros.bags.writer import McapWriter
 from codetr_ros.config import Settings
 from codetr_ros.intake import check_run
 from codetr_ros.records import (
@@ -146,7 +149,12 @@ class RecordNode(CoreNode):
             else self.folder and self.folder / run_folder.BAG
         )
         if folder:
-            self._bag = McapWriter(folder, [self._bag_topic(kind, settings) for kind in kinds])
+            self._bag = McapWriter(
+                folder,
+                [self._bag_topic(kind, settings) for kind in kinds],
+                split_bytes=round(self.values['bag_split_mb'] * 1e6),
+                keep_free=round(self.values['bag_keep_free_mb'] * 1e6),
+            )
             self.log.info(f'records to {folder}')
         assert self._run_message is not None
         self._write(RunSpec, self._run_message)
@@ -170,6 +178,8 @@ class RecordNode(CoreNode):
 
     def _take_raw(self, kind: type, raw: bytes) -> None:
         self.received[TOPICS[kind]] += 1
+        if self._bag is not None and self._bag.closed:
+            return  # stopped: others may still speak
         message = deserialize_message(raw, messages.message_type(kind))
         published = message.stamp.sec * 10**9 + message.stamp.nanosec
         assert self.run_spec is not None
@@ -207,12 +217,16 @@ class RecordNode(CoreNode):
             super().deliver(record)
             return
         if self._bag is not None:
+            self._bag.check_room()
+        message = self.link.message(record)
+        raw = serialize_message(message)
+        self._write(Commit, raw)
+        if self._bag is not None:
             began = time.perf_counter()
             self._bag.flush()
             self._flush_seconds.append(time.perf_counter() - began)
-        raw = serialize_message(self.link.publish(record))
         self._last.commit(record, raw)
-        self._write(Commit, raw)
+        self.link.send(TOPICS[Commit], message)
 
     def _send_again(
         self, request: FetchPhase.Request, response: FetchPhase.Response

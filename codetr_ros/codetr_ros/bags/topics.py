@@ -1,0 +1,109 @@
+"""A topic as rosbag2 describes it in a bag: QoS, definition and hash of its type."""
+
+import json
+import os
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from codetr_ros.bags.errors import BagError
+
+_FOREVER = {'sec': 9223372036, 'nsec': 854775807}
+
+
+@dataclass(frozen=True)
+class BagTopic:
+    """A topic as the bag describes it."""
+
+    name: str  # fully resolved, such as /run/transitions
+    type: str  # such as codetr_msgs/msg/Transitions
+    depth: int
+    transient_local: bool
+
+    def qos(self) -> list[dict[str, Any]]:
+        """The QoS it was offered with, as rosbag2 writes it (so that `ros2 bag play` offers the
+        same).
+        """
+        return [
+            {
+                'history': 'keep_last',
+                'depth': self.depth,
+                'reliability': 'reliable',
+                'durability': 'transient_local' if self.transient_local else 'volatile',
+                'deadline': dict(_FOREVER),
+                'lifespan': dict(_FOREVER),
+                'liveliness': 'automatic',
+                'liveliness_lease_duration': dict(_FOREVER),
+                'avoid_ros_namespace_conventions': False,
+            }
+        ]
+
+
+@cache
+def _share_folders() -> tuple[Path, ...]:
+    prefixes = [p for p in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]
+    return tuple(Path(prefix) / 'share' for prefix in (*prefixes, sys.prefix))
+
+
+def _interface_file(package: str, name: str, suffix: str) -> Path:
+    for share in _share_folders():
+        path = share / package / 'msg' / f'{name}.{suffix}'
+        if path.is_file():
+            return path
+    searched = ', '.join(str(share) for share in _share_folders())
+    raise BagError(
+        f'no {suffix} file of {package}/msg/{name} in {searched}: build the workspace, or '
+        f'source its setup file'
+    )
+
+
+def _contained(package: str, text: str) -> Iterable[tuple[str, str]]:
+    """Message types that a .msg text names as field types, in order."""
+    for line in text.splitlines():
+        kind = line.split('#', 1)[0].split(' ', 1)[0].split('[', 1)[0].split('<', 1)[0].strip()
+        if '/' in kind:
+            owner, _, name = kind.partition('/')
+            yield owner, name.removeprefix('msg/')
+        elif kind[:1].isupper():
+            yield package, kind
+
+
+@cache
+def schema_text(type_name: str) -> bytes:
+    """The definition of a message type and of all that it contains, in rosbag2's form.
+
+    Raises:
+        BagError: its .msg file is not installed.
+    """
+    package, _, name = type_name.split('/')
+    text = _interface_file(package, name, 'msg').read_text()
+    parts = [text]
+    seen = {(package, name)}
+    todo = list(_contained(package, text))
+    while todo:
+        key = todo.pop(0)
+        if key in seen:
+            continue
+        seen.add(key)
+        text = _interface_file(*key, 'msg').read_text()
+        parts.append(f'\n{"=" * 80}\nMSG: {key[0]}/{key[1]}\n{text}')
+        todo = [*_contained(key[0], text), *todo]
+    return ''.join(parts).encode()
+
+
+@cache
+def type_hash(type_name: str) -> str:
+    """REP-2016 hash of a message type (`RIHS01_...`), from its installed description.
+
+    Raises:
+        BagError: the description is not installed or does not name the type.
+    """
+    package, _, name = type_name.split('/')
+    path = _interface_file(package, name, 'json')
+    for entry in json.loads(path.read_text())['type_hashes']:
+        if entry['type_name'] == type_name:
+            return str(entry['hash_string'])
+    raise BagError(f'{path} has no hash of {type_name}: build the workspace again')
