@@ -386,13 +386,18 @@ def parse(data: Mapping[str, Any], source: str) -> Settings:
     try:
         return Settings.model_validate(data)
     except ValidationError as error:
-        lines = []
-        for e in error.errors():
-            name = '.'.join(str(part) for part in e['loc']) or 'settings'
-            value = '' if isinstance(e['input'], Mapping) else f' = {e["input"]!r}'
-            said = 'there is no such setting' if e['type'] == 'extra_forbidden' else e['msg']
-            lines.append(f'{source}: {name}{value}: {said}')
-        raise SettingsError('\n'.join(lines)) from None
+        raise SettingsError(explain(error, source)) from None
+
+
+def explain(error: ValidationError, source: str) -> str:
+    """What pydantic refuses, a line for each value: where it came from, name, value and reason."""
+    lines = []
+    for e in error.errors():
+        name = '.'.join(str(part) for part in e['loc']) or 'settings'
+        value = '' if isinstance(e['input'], Mapping) else f' = {e["input"]!r}'
+        said = 'there is no such setting' if e['type'] == 'extra_forbidden' else e['msg']
+        lines.append(f'{source}: {name}{value}: {said}')
+    return '\n'.join(lines)
 
 
 def load(name: str) -> Settings:
