@@ -253,13 +253,12 @@ def _flat(data: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]
             yield f'{prefix}{name}', value
 
 
-def session(spec: Path, workers: int, ray: str | None) -> dict[str, Any]:
+def session(spec: Path, workers: int) -> dict[str, Any]:
     """Who runs a benchmark: versions, commit, machine, time."""
     return {
         'began': time.strftime('%Y-%m-%dT%H:%M:%S%z'),
         'spec': str(spec),
         'workers': workers,
-        'ray': ray,
         **provenance(),
     }
 

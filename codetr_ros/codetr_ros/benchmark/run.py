@@ -16,7 +16,6 @@ def run(
     path: Path,
     out: Path,
     workers: int,
-    ray: str | None,
     retry_failed: bool,
     stopped: Callable[[], bool],
 ) -> dict[str, str]:
@@ -26,8 +25,7 @@ def run(
         spec: the benchmark.
         path: the file that it was read from.
         out: its folder.
-        workers: cells at a time; on Ray, the cluster decides.
-        ray: address of a Ray cluster, `local` for one on this machine; None runs without Ray.
+        workers: cells at a time.
         retry_failed: run failed cells again.
         stopped: whether somebody wants to stop.
 
@@ -35,17 +33,13 @@ def run(
         The cells that have failed, now or before, and why.
 
     Raises:
-        BenchmarkError: another spec's folder, another runner in it, no Ray.
+        BenchmarkError: another spec's folder, another runner in it.
     """
     folder = Folder(out)
     folder.check(spec)
-    if ray is not None:
-        from codetr_ros.benchmark import ray_pool
-
-        ray_pool.check()
     with folder.alone():
         folder.check(spec)  # nobody has changed it meanwhile, and nobody can from here on
-        folder.prepare(spec, session(path, workers, ray))
+        folder.prepare(spec, session(path, workers))
         left = folder.clear_attempts()
         jobs, failed = _todo(spec, folder, retry_failed)
         done = len(spec.cells) - len(jobs) - len(failed)
@@ -62,11 +56,8 @@ def run(
             if (aside := folder.set_aside(job.cell)) is not None:
                 overview.say(f'{job.cell} is not finished: what was there is now {aside}')
         with overview:
-            if ray is not None:
-                ray_pool.run(folder, jobs, ray, overview, stopped)
-            else:
-                _warn(jobs, workers, overview)
-                pool.run(folder, jobs, workers, overview, stopped)
+            _warn(jobs, workers, overview)
+            pool.run(folder, jobs, workers, overview, stopped)
     return failed | overview.failed
 
 

@@ -106,7 +106,8 @@ class Spec:
             for name, value in self.base.model_dump(mode='json').items()
             if name not in _AXES
         }
-        return yaml.safe_dump({**self.keys, 'config': shared}, sort_keys=False)
+        text = yaml.safe_dump({**self.keys, 'config': shared}, sort_keys=False)
+        return f'# Every setting of this benchmark: `codetr benchmark run` repeats it.\n{text}'
 
 
 def load(path: Path) -> Spec:
@@ -170,7 +171,13 @@ def _base(keys: _Keys, path: Path) -> Settings:
             f'{source}.{decided[0]} = {changes[decided[0]]!r}: the key {_AXES[decided[0]]} of '
             'the spec decides it; remove one of them'
         )
-    return config.load(name).changed(changes, source)
+    settings = config.load(name).changed(changes, source)
+    if not settings.evaluate_every:
+        raise BenchmarkError(
+            f'{source}.evaluate_every = 0: a run without evaluations has no score; give the steps '
+            'between evaluations'
+        )
+    return settings
 
 
 def _flatten(given: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:

@@ -36,14 +36,6 @@ class Run:
             metavar='N', help='cells at a time, each with as many threads as its settings say'
         ),
     ] = 1
-    ray: Annotated[
-        str | None,
-        tyro.conf.arg(
-            metavar='ADDRESS',
-            help='run the cells on a Ray cluster instead, whose nodes share DIR; `local` starts '
-            'one on this machine',
-        ),
-    ] = None
     retry_failed: Annotated[
         bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help='run failed cells again')
     ] = False
@@ -72,7 +64,6 @@ def _run(given: Annotated[Run, tyro.conf.OmitArgPrefixes]) -> int:
                 path,
                 out,
                 given.workers,
-                given.ray,
                 given.retry_failed,
                 lambda: interrupts.count > 0,
             )
