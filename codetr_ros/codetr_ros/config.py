@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterator, Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -383,8 +383,25 @@ def parse(data: Mapping[str, Any], source: str) -> Settings:
     Raises:
         SettingsError: names every offending setting, its value and what is allowed.
     """
+    return validate(Settings, data, source)
+
+
+_G = TypeVar('_G', bound=Group)
+
+
+def validate(kind: type[_G], data: Any, source: str) -> _G:
+    """Validate a group of settings that came from outside.
+
+    Args:
+        kind: the group.
+        data: nested mapping of settings; what is missing keeps its default.
+        source: where they came from (a file, a node, the command line), for the error.
+
+    Raises:
+        SettingsError: names every offending setting, its value and what is allowed.
+    """
     try:
-        return Settings.model_validate(data)
+        return kind.model_validate(data)
     except ValidationError as error:
         raise SettingsError(explain(error, source)) from None
 
