@@ -1,7 +1,40 @@
 """What can be wrong with a bag, and where."""
 
+from pathlib import Path
+from typing import NamedTuple
+
 
 class BagError(RuntimeError):
     """A bag that cannot be read, written or set up: names the file or the type, the place, the
     reason and the remedy.
     """
+
+
+class Place(NamedTuple):
+    """Where in a bag something lies."""
+
+    file: Path
+    offset: int  # MCAP: byte at which the record or its chunk begins; SQLite: row of `messages`
+    inside: int | None = None  # byte within the chunk's uncompressed records
+
+    def __str__(self) -> str:
+        if self.file.suffix == '.db3':
+            return f'{self.file} row {self.offset}'
+        inside = '' if self.inside is None else f', byte {self.inside} of that chunk'
+        return f'{self.file} byte {self.offset}{inside}'
+
+
+class Damage(NamedTuple):
+    """Something that was found wrong while reading."""
+
+    place: Place
+    text: str
+    lost: int  # bytes that could not be read; 0 where nothing is known to be missing
+    harmless: bool = False  # no message is missing or wrong by it: only an index or a summary is
+
+    def error(self) -> BagError:
+        """The same as an error, with the remedy."""
+        return BagError(
+            f'{self.place}: {self.text}. `codetr bag verify` lists all that is wrong with the '
+            'bag, `codetr bag recover` makes a whole one of what can be read'
+        )

@@ -48,14 +48,22 @@ def _share_folders() -> tuple[Path, ...]:
     return tuple(Path(prefix) / 'share' for prefix in (*prefixes, sys.prefix))
 
 
-def _interface_file(package: str, name: str, suffix: str) -> Path:
-    for share in _share_folders():
-        path = share / package / 'msg' / f'{name}.{suffix}'
-        if path.is_file():
-            return path
+def _installed(package: str, name: str, suffix: str) -> Path | None:
+    paths = (share / package / 'msg' / f'{name}.{suffix}' for share in _share_folders())
+    return next((path for path in paths if path.is_file()), None)
+
+
+def _interface_text(package: str, name: str) -> str:
+    """A definition as installed, or as it comes with the library where no ROS is installed."""
+    from codetr_ros.bags import definitions
+
+    if path := _installed(package, name, 'msg'):
+        return path.read_text()
+    if text := definitions.bundled_text(f'{package}/msg/{name}'):
+        return text
     searched = ', '.join(str(share) for share in _share_folders())
     raise BagError(
-        f'no {suffix} file of {package}/msg/{name} in {searched}: build the workspace, or '
+        f'no msg file of {package}/msg/{name} in {searched}: build the workspace, or '
         f'source its setup file'
     )
 
@@ -79,7 +87,7 @@ def schema_text(type_name: str) -> bytes:
         BagError: its .msg file is not installed.
     """
     package, _, name = type_name.split('/')
-    text = _interface_file(package, name, 'msg').read_text()
+    text = _interface_text(package, name)
     parts = [text]
     seen = {(package, name)}
     todo = list(_contained(package, text))
@@ -88,7 +96,7 @@ def schema_text(type_name: str) -> bytes:
         if key in seen:
             continue
         seen.add(key)
-        text = _interface_file(*key, 'msg').read_text()
+        text = _interface_text(*key)
         parts.append(f'\n{"=" * 80}\nMSG: {key[0]}/{key[1]}\n{text}')
         todo = [*_contained(key[0], text), *todo]
     return ''.join(parts).encode()
@@ -96,13 +104,21 @@ def schema_text(type_name: str) -> bytes:
 
 @cache
 def type_hash(type_name: str) -> str:
-    """REP-2016 hash of a message type (`RIHS01_...`), from its installed description.
+    """REP-2016 hash of a message type (`RIHS01_...`), from its installed description or, for what
+    comes with the library, from its definition.
 
     Raises:
         BagError: the description is not installed or does not name the type.
     """
+    from codetr_ros.bags import definitions
+
     package, _, name = type_name.split('/')
-    path = _interface_file(package, name, 'json')
+    path = _installed(package, name, 'json')
+    if path is None:
+        if definitions.bundled_text(type_name):
+            return definitions.own_types().hash_rihs01(type_name)
+        searched = ', '.join(str(share) for share in _share_folders())
+        raise BagError(f'no json file of {type_name} in {searched}: build the workspace')
     for entry in json.loads(path.read_text())['type_hashes']:
         if entry['type_name'] == type_name:
             return str(entry['hash_string'])

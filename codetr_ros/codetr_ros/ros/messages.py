@@ -17,20 +17,8 @@ import codetr_msgs.msg
 import numpy as np
 from builtin_interfaces.msg import Time
 
-from codetr_ros.records import (
-    TOPICS,
-    Commit,
-    Metrics,
-    Policy,
-    Presence,
-    Record,
-    RecordError,
-    StepRewards,
-    Transitions,
-    TrueRewards,
-)
-
-PACKAGE = 'codetr_msgs'
+from codetr_ros.received import PACKAGE, RECORD_TYPES, record_of, type_name
+from codetr_ros.records import Record, RecordError
 
 _SEQUENCES: dict[str, tuple[str, Any]] = {
     'float': ('f', np.float32),
@@ -46,14 +34,6 @@ _INTEGERS = {
     'int64': (-(2**63), 2**63 - 1),
     'uint64': (0, 2**64 - 1),
 }
-_PARALLEL: dict[type, tuple[tuple[str, ...], ...]] = {
-    Presence: (('topics', 'published'),),
-    Policy: (('sources', 'steps'),),
-    Commit: (('sources', 'transitions'), ('scorers', 'scores')),
-    StepRewards: (('episodes', 'first_steps', 'lengths'),),
-    Metrics: (('names', 'values'),),
-}
-"""Arrays that must be as long as the first of their row."""
 
 
 @dataclass(frozen=True)
@@ -66,15 +46,6 @@ class _Field:
 def message_type(record_type: type) -> Any:
     """The message class that carries this kind of record."""
     return getattr(codetr_msgs.msg, record_type.__name__)
-
-
-def type_name(record_type: type) -> str:
-    """The full name of that message type, as bags and services call it."""
-    return f'{PACKAGE}/msg/{record_type.__name__}'
-
-
-RECORD_TYPES: dict[str, type] = {type_name(record_type): record_type for record_type in TOPICS}
-"""The kind of record that a message type carries."""
 
 
 def _integer(low: int, high: int) -> Callable[[Any], int]:
@@ -163,46 +134,4 @@ def from_message(message: Any) -> Record:
     values = {
         field.name: field.inward(getattr(message, field.name)) for field in _fields(record_type)
     }
-    _check_lengths(record_type, values)
-    if record_type is Transitions:
-        _shape(values)
-    return record_type(**values)  # type: ignore[no-any-return]
-
-
-def _refuse(record_type: type, values: dict[str, Any], field: str, expected: str) -> RecordError:
-    who = values.get('source') or values.get('node') or values.get('role') or 'its publisher'
-    where = ', '.join(
-        f'{name}={values[name]}' for name in ('sequence', 'phase', 'part') if name in values
-    )
-    return RecordError(
-        f'{record_type.__name__}({where}) from {who!r}: {field} has length '
-        f'{len(values[field])}, expected {expected}; '
-        f'mend what {who!r} publishes on {TOPICS[record_type]!r}'
-    )
-
-
-def _check_lengths(record_type: type, values: dict[str, Any]) -> None:
-    for first, *others in _PARALLEL.get(record_type, ()):
-        for name in others:
-            if len(values[name]) != len(values[first]):
-                raise _refuse(record_type, values, name, f'{len(values[first])} as {first}')
-    if record_type is StepRewards:
-        steps = int(values['lengths'].sum(dtype=np.uint64))
-        if len(values['labels']) != steps:
-            raise _refuse(record_type, values, 'labels', f'{steps}, the sum of lengths')
-    if record_type is TrueRewards and not len(values['rewards']):
-        raise _refuse(record_type, values, 'rewards', 'at least 1')
-
-
-def _shape(values: dict[str, Any]) -> None:
-    steps = values['steps']
-    for name, rows in (('observations', steps + 1), ('actions', steps)):
-        length = len(values[name])
-        if steps < 1 or length < rows or length % rows:
-            expected = (
-                f'a multiple of {rows} for steps={steps}'
-                if steps
-                else 'steps of at least 1, not 0'
-            )
-            raise _refuse(Transitions, values, name, expected)
-        values[name] = values[name].reshape(rows, length // rows)
+    return record_of(record_type, values)

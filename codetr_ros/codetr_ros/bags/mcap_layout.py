@@ -1,0 +1,148 @@
+"""How an MCAP file is laid out: its records, and where the next sound one begins."""
+
+import mmap
+import re
+import struct
+from io import BytesIO
+from typing import Any, BinaryIO
+
+import lz4.frame
+import zstandard
+from mcap import records as mcap_records
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+
+MAGIC = b'\x89MCAP0\r\n'
+LARGEST_RECORD = 256 << 20
+"""Bytes that a record, compressed or not, may have: what claims more is taken for damage. A reader
+holds one record and what it decompresses to."""
+
+HEAD = struct.Struct('<BQ')  # opcode, length of what follows
+CHUNK = struct.Struct('<QQQII')  # start, end, size, crc, length of the compression's name
+MESSAGE = struct.Struct('<BQHIQQ')  # head, channel, sequence, log time, publish time
+MESSAGE_BODY = MESSAGE.size - HEAD.size
+_CHUNK_START = re.compile(
+    rb'\x06.{8}.{28}(?:\x00{4}|\x03\x00{3}lz4|\x04\x00{3}zstd).{8}', re.DOTALL
+)
+SUMMARY = {
+    Opcode.SCHEMA: mcap_records.Schema,
+    Opcode.CHANNEL: mcap_records.Channel,
+    Opcode.STATISTICS: mcap_records.Statistics,
+    Opcode.CHUNK_INDEX: mcap_records.ChunkIndex,
+    Opcode.ATTACHMENT_INDEX: mcap_records.AttachmentIndex,
+    Opcode.METADATA_INDEX: mcap_records.MetadataIndex,
+    Opcode.SUMMARY_OFFSET: mcap_records.SummaryOffset,
+}
+SMALL = {
+    Opcode.HEADER: mcap_records.Header,
+    Opcode.SCHEMA: mcap_records.Schema,
+    Opcode.CHANNEL: mcap_records.Channel,
+    Opcode.MESSAGE_INDEX: mcap_records.MessageIndex,
+    Opcode.METADATA: mcap_records.Metadata,
+    Opcode.DATA_END: mcap_records.DataEnd,
+}
+
+
+class FaultError(Exception):
+    """Something in the file is not as it must be."""
+
+
+def full_type_name(name: str) -> str:
+    """`package/msg/Name`, where some writers have `package/Name`."""
+    package, _, rest = name.partition('/')
+    return name if '/' in rest else f'{package}/msg/{rest}'
+
+
+def parse_record(kind: Any, content: bytes | memoryview) -> Any:
+    """A record of the file's structure from its bytes.
+
+    Raises:
+        FaultError: they are no such record.
+    """
+    stream = ReadDataStream(BytesIO(content))
+    try:
+        record = kind.read(stream)
+    except (McapError, struct.error, UnicodeDecodeError) as error:
+        raise FaultError(f'a {kind.__name__} record cannot be read: {error}') from error
+    if stream.count != len(content):
+        raise FaultError(f'a {kind.__name__} record has {len(content)} bytes, not {stream.count}')
+    return record
+
+
+def decompressed(data: memoryview, compression: str, size: int) -> bytes | memoryview:
+    """A chunk's records.
+
+    Raises:
+        FaultError: the data is damaged, or does not have that size.
+    """
+    if compression == '':
+        raw: bytes | memoryview = data
+    elif compression == 'zstd':
+        try:
+            with zstandard.ZstdDecompressor().stream_reader(data) as stream:
+                raw = stream.read(size + 1)
+        except (zstandard.ZstdError, MemoryError) as error:
+            raise FaultError(f'its zstd data is damaged ({error})') from error
+    elif compression == 'lz4':
+        try:
+            raw = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+        except (RuntimeError, MemoryError) as error:
+            raise FaultError(f'its lz4 data is damaged ({error})') from error
+    else:
+        raise FaultError(f'its compression {compression!r} is not known')
+    if len(raw) != size:
+        raise FaultError(f'it has {len(raw)} bytes where {size} are announced')
+    return raw
+
+
+def chunk_head(content: bytes) -> tuple[int, int, int, int, int]:
+    """The numbers at a chunk's beginning, if its lengths agree.
+
+    Raises:
+        FaultError: they do not.
+    """
+    if len(content) < CHUNK.size + 8:
+        raise FaultError(f'a chunk of {len(content)} bytes')
+    start, end, size, crc, named = CHUNK.unpack_from(content)
+    begin = CHUNK.size + named + 8
+    if begin > len(content):
+        raise FaultError(f'a chunk whose compression has a name of {named} bytes')
+    (length,) = struct.unpack_from('<Q', content, begin - 8)
+    if begin + length != len(content):
+        raise FaultError(f'a chunk of {len(content) - begin} bytes that says it has {length}')
+    return start, end, size, crc, named
+
+
+def resume_at(file: BinaryIO, at: int, size: int) -> int:
+    """Where to go on behind a record that cannot be read: at the next chunk, or at the record that
+    follows by its length, whichever comes first.
+    """
+    chunk = next_chunk(file, at + 1, size)
+    file.seek(at)
+    head = file.read(HEAD.size)
+    if len(head) < HEAD.size:
+        return size
+    follows: int = at + HEAD.size + HEAD.unpack(head)[1]
+    if follows >= min(chunk, size - HEAD.size):
+        return chunk
+    file.seek(follows)
+    opcode, length = HEAD.unpack(file.read(HEAD.size))
+    known = opcode in Opcode.__members__.values()
+    return follows if known and follows + HEAD.size + length <= size else chunk
+
+
+def next_chunk(file: BinaryIO, at: int, size: int) -> int:
+    """Where the next chunk begins whose lengths agree; the file's size if there is none."""
+    if at >= size:
+        return size
+    with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as view:
+        while match := _CHUNK_START.search(view, at):
+            found, name = match.start(), CHUNK.size
+            _, length = HEAD.unpack_from(view, found)
+            (named,) = struct.unpack_from('<I', view, found + HEAD.size + name - 4)
+            (data,) = struct.unpack_from('<Q', view, found + HEAD.size + name + named)
+            if length == name + named + 8 + data and found + HEAD.size + length <= size:
+                return found
+            at = found + 1
+    return size

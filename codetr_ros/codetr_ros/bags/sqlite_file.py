@@ -1,0 +1,125 @@
+"""One SQLite file as rosbag2 and rosbags write it, read in the order of its rows.
+
+SQLite keeps no checksums: pages that contradict each other are noticed, a changed number is not.
+"""
+
+import sqlite3
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import quote
+
+from codetr_ros.bags.definitions import Definition
+from codetr_ros.bags.errors import BagError, Damage, Place
+from codetr_ros.bags.mcap_file import Channel, OnDamage, RawMessage
+from codetr_ros.bags.mcap_layout import LARGEST_RECORD
+
+
+class SqliteFile:
+    """Reads one file; with the attributes of `McapFile`.
+
+    Args:
+        path: the file.
+        on_damage: is told what is wrong; by default that is an error.
+        shown: what it is called in places and errors, where it has been unpacked.
+    """
+
+    def __init__(
+        self, path: Path, on_damage: OnDamage | None = None, shown: Path | None = None
+    ) -> None:
+        self.path = path
+        self.shown = shown or path
+        self.library = ''
+        self.counts: Counter[str] = Counter()
+        self.chunks = 0
+        self.unchecked = 0
+        self.finished = False
+        self._on_damage = on_damage
+        self._channels: dict[int, Channel] = {}
+
+    def channels(self) -> list[Channel]:
+        """The topics that the file describes; empty before the first message is asked for."""
+        return list(self._channels.values())
+
+    def messages(self) -> Iterator[RawMessage]:
+        """Every message, in the order of the rows.
+
+        Raises:
+            BagError: the file cannot be opened, is no such database, or is damaged (unless that is
+                told to `on_damage`).
+        """
+        row = 0
+        try:
+            size = self.path.stat().st_size
+            if not size:
+                raise sqlite3.DatabaseError('it is empty')
+            connection = self._connect()
+            try:
+                self._channels = _channels(connection)
+                # what claims more than the file has is not even asked for
+                rows = connection.execute(
+                    'SELECT id, topic_id, timestamp, length(data), '
+                    'CASE WHEN length(data) <= ? THEN data END FROM messages ORDER BY id',
+                    (min(size, LARGEST_RECORD),),
+                )
+                for number, topic, time, length, data in rows:
+                    row = number
+                    channel = self._channels.get(topic)
+                    if channel is None or not isinstance(data, bytes) or type(time) is not int:
+                        self._say(
+                            row, f'this is no message of a topic it knows: {topic!r}', length
+                        )
+                        continue
+                    self.counts[channel.topic] += 1
+                    self.unchecked += 1
+                    yield RawMessage(channel, time, time, 0, data, Place(self.shown, row))
+                self.finished = True
+            finally:
+                connection.close()
+        except OSError as error:
+            raise BagError(f'{self.shown} cannot be read: {error.strerror}') from error
+        except (sqlite3.Error, UnicodeDecodeError, OverflowError) as error:
+            self._say(row, f'the database is damaged here or behind it: {error}', 0)
+
+    def _say(self, row: int, text: str, lost: int) -> None:
+        damage = Damage(Place(self.shown, row), text, lost or 0)
+        if self._on_damage is None:
+            raise damage.error()
+        self._on_damage(damage)
+
+    def _connect(self) -> sqlite3.Connection:
+        """Open for reading only. A journal that a killed recorder left beside the file is part of
+        it, and SQLite needs to write in its folder to read it.
+        """
+        journal = self.path.with_name(f'{self.path.name}-wal')
+        left = journal.exists() and journal.stat().st_size
+        how = 'mode=ro' if left else 'mode=ro&immutable=1'
+        return sqlite3.connect(f'file:{quote(str(self.path))}?{how}', uri=True)
+
+
+def _columns(connection: sqlite3.Connection, table: str) -> set[str]:
+    return {row[1] for row in connection.execute(f'PRAGMA table_info({table})')}
+
+
+def _channels(connection: sqlite3.Connection) -> dict[int, Channel]:
+    """The topics. Older files have fewer columns, and no definitions."""
+    definitions: dict[str, tuple[str, str]] = {}
+    if _columns(connection, 'message_definitions'):
+        definitions = {
+            name: (encoding, text)
+            for name, encoding, text in connection.execute(
+                'SELECT topic_type, encoding, encoded_message_definition FROM message_definitions'
+            )
+        }
+    columns = _columns(connection, 'topics')
+    optional = [
+        name if name in columns else "''"
+        for name in ('offered_qos_profiles', 'type_description_hash')
+    ]
+    found = {}
+    for number, topic, kind, encoding, qos, digest in connection.execute(
+        f'SELECT id, name, type, serialization_format, {", ".join(optional)} FROM topics'
+    ):
+        definition = Definition(*definitions.get(kind, ('', '')), digest)
+        found[number] = Channel(topic, kind, encoding, definition, qos)
+    return found

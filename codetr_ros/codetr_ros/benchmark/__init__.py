@@ -1,1 +1,0 @@
-"""Many runs under one protocol: cells made by a spec, run by workers, read by a report."""

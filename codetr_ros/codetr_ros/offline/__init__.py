@@ -1,1 +1,0 @@
-"""Reward models from bags: fitted, judged and put to use without any node and without ROS."""
