@@ -39,6 +39,10 @@ def tiny(**changes: Any) -> Settings:
         'codetr.batch': 8,
         'codetr.first_gradient_steps': 5,
         'codetr.gradient_steps': 2,
+        'mlp.hidden': (16,),
+        'mlp.batch': 8,
+        'mlp.first_gradient_steps': 5,
+        'mlp.gradient_steps': 2,
         'codetr.dropout': 0.1,  # so that equality covers the random masks too
     }
     return load('quick').changed(

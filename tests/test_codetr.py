@@ -14,7 +14,9 @@ from codetr_ros.composite import composite
 from codetr_ros.config import Settings
 from codetr_ros.records import CompositeReward, Transitions
 from codetr_ros.rewards import RewardModelError
-from codetr_ros.rewards.codetr import STD_FLOOR, Codetr, learning_rate
+from codetr_ros.rewards.codetr import Codetr
+from codetr_ros.rewards.learned import STD_FLOOR
+from codetr_ros.rewards.sequence import learning_rate
 from codetr_ros.rewards.transformer import CausalSelfAttention, RewardTransformer
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.trajectories import SegmentBatch, Trajectories

@@ -12,7 +12,7 @@ from builders import OBSERVATION as O
 from codetr_ros import rewards
 from codetr_ros.config import IN_PROCESS_ONLY, Method, Settings
 from codetr_ros.records import F32, CompositeReward, TrueRewards
-from codetr_ros.rewards import RewardMethod, RewardModelError, segment_steps
+from codetr_ros.rewards import RewardMethod, RewardModelError, Schedule, segment_steps
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.trajectories import SegmentBatch, Trajectories
 
@@ -70,6 +70,7 @@ class Contract:
 
     method: Method
     changes: ClassVar[dict[str, Any]] = {}
+    has_unit: ClassVar[bool] = True  # its labels are composite rewards' shares, in their unit
 
     def settings(self, **changes: Any) -> Settings:
         return builders.tiny(**{'method': self.method, 'delay': DELAY} | self.changes | changes)
@@ -185,28 +186,77 @@ class Contract:
         scaled, raw = self.trained(memory), self.trained(memory, reward_unit='raw')
         assert scaled.target_scale == raw.target_scale == memory.score_scale()
         batch = batch_of(memory, scaled)
-        factor = 1.0 if self.method == 'ones' else scaled.target_scale
+        factor = scaled.target_scale if self.has_unit else 1.0
         np.testing.assert_allclose(raw.label(batch), scaled.label(batch) * factor, rtol=1e-5)
 
-    def test_a_frozen_method_never_changes_a_label_and_another_counts_its_gradient_steps(self):
+    def test_labels_change_with_the_version_and_only_then(self):
         memory = filled()
         made = self.trained(memory, steps=0)
-        before = made.label(batch_of(memory, made))
+        version, before = made.version, made.label(batch_of(memory, made))
+        made.prepare(memory)  # of what it has seen
+        assert made.version == version
+        assert made.label(batch_of(memory, made)).tobytes() == before.tobytes()
         self.train(made, memory, range(3))
         after = made.label(batch_of(memory, made))
-        assert (after.tobytes() == before.tobytes()) == made.frozen
-        assert made.version == (0 if made.frozen else 3)
+        assert (after.tobytes() == before.tobytes()) == (made.version == version)
+
+    def test_it_counts_the_gradient_steps_that_its_schedule_asks_for(self):
+        memory = filled()
+        made = self.trained(memory)
+        learns = made.schedule != Schedule(0, 0)
+        assert made.gradient_steps == (3 if learns else 0)
+
+    def test_the_passes_of_labelling_give_every_step_its_label_in_order(self):
+        memory = filled()
+        made = self.trained(memory)
+        ids = memory.segment_ids()[1:4]
+        batch = memory.segment_batch(ids, made.context)
+        found = np.concatenate(list(made.label_passes(memory, ids)))
+        np.testing.assert_allclose(found, made.label(batch)[segment_steps(batch)], rtol=1e-5)
 
 
-class TestCodetr(Contract):
-    method = 'codetr'
+class LearnedContract(Contract):
+    """A method that takes gradient steps, by its own group of settings."""
+
+    def test_its_schedule_is_that_of_its_settings(self):
+        group = type(self.make()).group
+        changes = {f'{group}__first_gradient_steps': 17, f'{group}__gradient_steps': 3}
+        assert self.make(**changes).schedule == Schedule(17, 3)
 
     def test_a_gradient_step_says_its_loss_and_learning_rate(self):
         memory = filled()
         made = self.trained(memory)
         said = made.gradient_step(memory, generator(0))
-        assert said.keys() == {'reward_loss', 'learning_rate'}
-        assert all(type(value) is float and value > 0 for value in said.values())
+        assert {'reward_loss', 'learning_rate'} <= said.keys()
+        assert all(type(value) is float and np.isfinite(value) for value in said.values())
+
+    def test_a_state_of_another_task_is_refused(self):
+        made, other = self.make(), rewards.make(self.settings(), O + 1, A)
+        with pytest.raises(RewardModelError, match=r'observation_mean is \(4,\).*expected \(3,\)'):
+            made.load_state(other.state())
+
+    def test_a_gradient_step_before_it_was_prepared_is_refused(self):
+        with pytest.raises(RewardModelError, match='call prepare'):
+            self.make().gradient_step(filled(), generator(0))
+
+    def test_training_that_has_diverged_is_refused_and_changes_nothing(self):
+        memory = filled()
+        made = self.trained(memory)
+        with torch.no_grad():
+            *_, last = made.network.parameters()
+            last.fill_(float('nan'))
+        before = [p.clone() for p in made.network.parameters()]
+        group = type(made).group
+        with pytest.raises(
+            RewardModelError, match=rf'is nan at gradient step 3.*Lower {group}.learning_rate = '
+        ):
+            made.gradient_step(memory, generator(0))
+        for parameter, kept in zip(made.network.parameters(), before, strict=True):
+            torch.testing.assert_close(parameter, kept, rtol=0, atol=0, equal_nan=True)
+
+
+class TestCodetr(LearnedContract):
+    method = 'codetr'
 
     @pytest.mark.parametrize(
         'change',
@@ -225,15 +275,6 @@ class TestCodetr(Contract):
             made.load_state(other.state())
         assert equal(made.state(), before)
 
-    def test_a_state_of_another_task_is_refused(self):
-        made, other = self.make(), rewards.make(self.settings(), O + 1, A)
-        with pytest.raises(RewardModelError, match=r'observation_mean is \(4,\).*expected \(3,\)'):
-            made.load_state(other.state())
-
-    def test_a_gradient_step_before_it_was_prepared_is_refused(self):
-        with pytest.raises(RewardModelError, match='call prepare'):
-            self.make().gradient_step(filled(), generator(0))
-
 
 class TestCodetrAsInThePaper(TestCodetr):
     changes: ClassVar[dict[str, Any]] = {'codetr__tokens': 'pair', 'codetr__schedule': 'cosine'}
@@ -249,6 +290,15 @@ class TestCodetrWithContext(TestCodetr):
 
 class TestCodetrOfRewardsAlone(TestCodetr):
     changes: ClassVar[dict[str, Any]] = {'codetr__label': 'rhat', 'codetr__head_scale': 'one'}
+
+
+class TestMlp(LearnedContract):
+    method = 'mlp'
+
+
+class TestIrcr(Contract):
+    method = 'ircr'
+    has_unit = False
 
 
 class Rule(Contract):
@@ -269,13 +319,6 @@ class Rule(Contract):
             np.testing.assert_allclose(
                 labels[:length], self.expected(value, true[:length]), rtol=1e-6
             )
-
-    def test_windows_are_refused(self):
-        memory = filled()
-        made = self.trained(memory)
-        window = next(iter(memory.windows(memory.segment_ids(), 5, 10)))
-        with pytest.raises(RewardModelError, match='labels whole segments, not windows'):
-            made.label_windows(window)
 
 
 class TestLastStep(Rule):
@@ -311,6 +354,7 @@ class TestTrueReward(Rule):
 
 class TestOnes(Rule):
     method = 'ones'
+    has_unit = False
 
     @staticmethod
     def expected(value: float, true: F32) -> F32:
@@ -321,7 +365,7 @@ def test_a_method_that_does_not_exist_is_refused_by_name():
     unchecked = builders.tiny().model_copy(update={'method': 'magic'})
     with pytest.raises(
         RewardModelError,
-        match=r"method = 'magic'.*choose one of codetr, none, uniform, true, ones",
+        match=r"method = 'magic'.*choose one of codetr, none, .*true, ones",
     ):
         rewards.make(unchecked, O, A)
 

@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterator, Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -21,7 +21,8 @@ from codetr_ros.records import PROTOCOL_VERSION, RunSpec
 Composite = Literal[
     'sum', 'sum_square', 'square_sum', 'max', 'max_hard', 'max_log_sum_exp', 'max_times_n'
 ]
-Method = Literal['codetr', 'none', 'uniform', 'true', 'ones']
+Method = Literal['codetr', 'none', 'ircr', 'mlp', 'uniform', 'true', 'ones']
+Hidden = tuple[Annotated[int, Field(ge=1, le=65536)], ...]
 IN_PROCESS_ONLY: tuple[str, ...] = ('true', 'ones')
 """Reference methods: they look at what no node may see (`true`) or ignore the scores (`ones`)."""
 SCORE_LEARNERS: tuple[str, ...] = ()
@@ -132,10 +133,37 @@ class CodetrSettings(Group):
         return self
 
 
+class PerceptronSettings(Group):
+    """A reward model that sees one step at a time."""
+
+    hidden: Hidden = Field(
+        (256, 256), min_length=1, max_length=8, description='hidden layer widths of the reward net'
+    )
+    learning_rate: float = Field(3e-4, gt=0, le=1, description='AdamW learning rate')
+    weight_decay: float = Field(
+        0.0, ge=0, le=1, description='AdamW weight decay; 0 makes it plain Adam'
+    )
+    first_gradient_steps: int = Field(
+        100, ge=0, le=10**6, description='gradient steps after the last warm-up phase'
+    )
+    gradient_steps: int = Field(
+        10, ge=0, le=10**6, description='gradient steps after every later phase'
+    )
+    normalise_observations: bool = Field(
+        True, description='standardise observations by warm-up mean and deviation (decided here)'
+    )
+
+
+class MlpSettings(PerceptronSettings):
+    """The Markovian control: trained on segments as the transformer is."""
+
+    batch: int = Field(64, ge=1, le=65536, description='segments in a gradient step')
+
+
 class SacSettings(Group):
     """Soft actor-critic as jaxrl has it (section 8 of the method)."""
 
-    hidden: tuple[Annotated[int, Field(ge=1, le=65536)], ...] = Field(
+    hidden: Hidden = Field(
         (256, 256), min_length=1, max_length=8, description='hidden layer widths'
     )
     batch: int = Field(256, ge=1, le=65536, description='steps in an update')
@@ -232,6 +260,9 @@ class Settings(Group):
     threads: int = Field(1, ge=1, le=256, description='torch threads of each process')
     codetr: CodetrSettings = Field(
         default_factory=CodetrSettings, description='the reward transformer'
+    )
+    mlp: MlpSettings = Field(
+        default_factory=MlpSettings, description='the reward model of single steps'
     )
     sac: SacSettings = Field(default_factory=SacSettings, description='the policy learner')
 
@@ -352,16 +383,38 @@ def parse(data: Mapping[str, Any], source: str) -> Settings:
     Raises:
         SettingsError: names every offending setting, its value and what is allowed.
     """
+    return validate(Settings, data, source)
+
+
+_G = TypeVar('_G', bound=Group)
+
+
+def validate(kind: type[_G], data: Any, source: str) -> _G:
+    """Validate a group of settings that came from outside.
+
+    Args:
+        kind: the group.
+        data: nested mapping of settings; what is missing keeps its default.
+        source: where they came from (a file, a node, the command line), for the error.
+
+    Raises:
+        SettingsError: names every offending setting, its value and what is allowed.
+    """
     try:
-        return Settings.model_validate(data)
+        return kind.model_validate(data)
     except ValidationError as error:
-        lines = []
-        for e in error.errors():
-            name = '.'.join(str(part) for part in e['loc']) or 'settings'
-            value = '' if isinstance(e['input'], Mapping) else f' = {e["input"]!r}'
-            said = 'there is no such setting' if e['type'] == 'extra_forbidden' else e['msg']
-            lines.append(f'{source}: {name}{value}: {said}')
-        raise SettingsError('\n'.join(lines)) from None
+        raise SettingsError(explain(error, source)) from None
+
+
+def explain(error: ValidationError, source: str) -> str:
+    """What pydantic refuses, a line for each value: where it came from, name, value and reason."""
+    lines = []
+    for e in error.errors():
+        name = '.'.join(str(part) for part in e['loc']) or 'settings'
+        value = '' if isinstance(e['input'], Mapping) else f' = {e["input"]!r}'
+        said = 'there is no such setting' if e['type'] == 'extra_forbidden' else e['msg']
+        lines.append(f'{source}: {name}{value}: {said}')
+    return '\n'.join(lines)
 
 
 def load(name: str) -> Settings:

@@ -118,12 +118,16 @@ def threading_environment(settings: Settings) -> dict[str, str]:
     }
 
 
-def _end_with_parent() -> Callable[[], None] | None:
+def end_with_parent(number: signal.Signals = signal.SIGINT) -> Callable[[], None] | None:
     """What a child calls before it becomes another program, so as not to outlive its parent.
 
-    Linux only (elsewhere None): prctl(PR_SET_PDEATHSIG) makes the kernel send SIGINT when the
-    parent dies, however it dies, SIGKILL included. Everything is looked up here: between fork and
-    exec nothing but the call itself is safe.
+    Linux only (elsewhere None): prctl(PR_SET_PDEATHSIG) makes the kernel send the signal when the
+    parent dies (to be exact: the thread that started the child), however it dies, SIGKILL
+    included. Everything is looked up here: between fork and exec nothing but the call itself is
+    safe.
+
+    Args:
+        number: the signal; SIGINT lets the child save what it has.
     """
     if not sys.platform.startswith('linux'):
         return None
@@ -132,7 +136,7 @@ def _end_with_parent() -> Callable[[], None] | None:
     parent = os.getpid()
 
     def call() -> None:
-        prctl(set_parent_death_signal, int(signal.SIGINT), 0, 0, 0)
+        prctl(set_parent_death_signal, int(number), 0, 0, 0)
         if os.getppid() != parent:  # it died before the call: the signal will never come
             os._exit(1)
 
@@ -220,7 +224,7 @@ class Processes:
         Raises:
             LaunchError: one cannot be started; those started before it still run (see `stop`).
         """
-        prepare = _end_with_parent()
+        prepare = end_with_parent()
         for command in commands:
             log = logs / f'{command.name}.log'
             with log.open('wb') as file:

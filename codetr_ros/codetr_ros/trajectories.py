@@ -387,11 +387,19 @@ class Trajectories:
         """Segments by id, each with up to `context` steps of its episode before it."""
         spans = self._spans(ids)
         rows, lengths, offsets = spans[:, 0], spans[:, 1], spans[:, 2]
+        before = np.minimum(context, offsets)
+        return self._windows(ids, rows - before, lengths + before, before, self.scores(ids))
+
+    def scores(self, ids: I64) -> F64:
+        """Composite rewards of segments by id."""
         values = np.empty(len(ids), np.float64)
         for _, source, mine, at in self._by_source(ids):
             values[mine] = source.segment_values[at]
-        before = np.minimum(context, offsets)
-        return self._windows(ids, rows - before, lengths + before, before, values)
+        return values
+
+    def lengths(self, ids: I64) -> I64:
+        """Steps of segments by id."""
+        return self._spans(ids)[:, 1]
 
     def windows(self, ids: I64, window: int, batch: int) -> Iterator[SegmentBatch]:
         """For each step of the segments, in order, the last `window` steps of its episode that end

@@ -15,7 +15,9 @@ Learn a task from composite delayed rewards, with ROS 2 nodes or in one process.
 
 commands:
   train      train on a task: starts all nodes, shows progress, ends with a report
+  fit        fit a reward model to bags, without any node
   evaluate   evaluate the policy of a run's newest checkpoint
+  benchmark  many runs under one protocol, and the table that they make
   tasks      list the tasks that have a name
   doctor     check Python, ROS, discovery, shared memory, torch and MuJoCo
 
@@ -29,10 +31,22 @@ def _train(arguments: Sequence[str]) -> int:
     return train.main(arguments)
 
 
+def _fit(arguments: Sequence[str]) -> int:
+    from codetr_ros.cli import fit
+
+    return fit.main(arguments)
+
+
 def _evaluate(arguments: Sequence[str]) -> int:
     from codetr_ros.cli import evaluate
 
     return evaluate.main(arguments)
+
+
+def _benchmark(arguments: Sequence[str]) -> int:
+    from codetr_ros.cli import benchmark
+
+    return benchmark.main(arguments)
 
 
 def _tasks(arguments: Sequence[str]) -> int:
@@ -49,7 +63,9 @@ def _doctor(arguments: Sequence[str]) -> int:
 
 COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     'train': _train,
+    'fit': _fit,
     'evaluate': _evaluate,
+    'benchmark': _benchmark,
     'tasks': _tasks,
     'doctor': _doctor,
 }

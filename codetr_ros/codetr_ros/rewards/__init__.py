@@ -2,15 +2,39 @@
 
 from codetr_ros.config import Settings
 from codetr_ros.rewards.codetr import Codetr
-from codetr_ros.rewards.method import RewardMethod, RewardModelError, segment_steps
+from codetr_ros.rewards.ircr import Ircr
+from codetr_ros.rewards.method import RewardMethod, RewardModelError, Schedule, segment_steps
+from codetr_ros.rewards.mlp import Mlp
 from codetr_ros.rewards.redistribution import LastStep, Ones, TrueReward, Uniform
 
-__all__ = ['METHODS', 'RewardMethod', 'RewardModelError', 'make', 'segment_steps']
+__all__ = [
+    'METHODS',
+    'RewardMethod',
+    'RewardModelError',
+    'Schedule',
+    'kind',
+    'make',
+    'segment_steps',
+]
 
-METHODS: dict[str, type[Codetr | LastStep | Uniform | TrueReward | Ones]] = {
-    method.name: method for method in (Codetr, LastStep, Uniform, TrueReward, Ones)
+METHODS: dict[str, type[RewardMethod]] = {
+    method.name: method for method in (Codetr, LastStep, Ircr, Mlp, Uniform, TrueReward, Ones)
 }
 """Reward methods by the name that `settings.method` gives them."""
+
+
+def kind(settings: Settings) -> type[RewardMethod]:
+    """The reward method that the settings name.
+
+    Raises:
+        RewardModelError: there is no such method.
+    """
+    if settings.method not in METHODS:
+        raise RewardModelError(
+            f'method = {settings.method!r}: there is no such reward method; '
+            f'choose one of {", ".join(METHODS)}'
+        )
+    return METHODS[settings.method]
 
 
 def make(settings: Settings, observation_size: int, action_size: int) -> RewardMethod:
@@ -24,9 +48,4 @@ def make(settings: Settings, observation_size: int, action_size: int) -> RewardM
     Raises:
         RewardModelError: there is no such method.
     """
-    if settings.method not in METHODS:
-        raise RewardModelError(
-            f'method = {settings.method!r}: there is no such reward method; '
-            f'choose one of {", ".join(METHODS)}'
-        )
-    return METHODS[settings.method](settings, observation_size, action_size)
+    return kind(settings)(settings, observation_size, action_size)

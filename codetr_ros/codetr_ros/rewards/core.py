@@ -24,7 +24,6 @@ from codetr_ros.records import (
     Transitions,
     TrueRewards,
 )
-from codetr_ros.rewards.method import segment_steps
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.trajectories import Trajectories
 
@@ -46,7 +45,7 @@ class Labeller(Consumer):
     subscribes: tuple[type, ...] = (TaskSpec, Transitions, CompositeReward, Commit)
 
     def __init__(self, run: RunSpec, settings: Settings, name: str, folder: Path | None) -> None:
-        oracle = settings.method == 'true'
+        oracle = rewards.kind(settings).needs_true_rewards
         if oracle:
             self.subscribes = (*self.subscribes, TrueRewards)
         super().__init__(run, settings, name, folder, scores=True, true_rewards=oracle)
@@ -68,8 +67,8 @@ class Labeller(Consumer):
         if not learns:
             self._phase = phase + 1
             return
-        if method.target_scale == 0 and len(memory.segment_ids()):
-            method.prepare(memory)  # once; later where nothing was scored in the warm-up
+        if len(memory.segment_ids()):
+            method.prepare(memory)
         metrics: dict[str, float] = {}
         for said in self._fit(phase, memory, method):
             metrics |= said
@@ -81,7 +80,7 @@ class Labeller(Consumer):
             yield []
         metrics |= {
             'target_scale': method.target_scale,
-            'gradient_steps': method.version,
+            'gradient_steps': method.gradient_steps,
             'label_seconds': time.perf_counter() - began,
         }
         self._phase = phase + 1
@@ -90,10 +89,7 @@ class Labeller(Consumer):
     def _fit(
         self, phase: int, memory: Trajectories, method: rewards.RewardMethod
     ) -> Iterator[dict[str, float]]:
-        codetr = self._settings.codetr
-        steps = 0
-        if not method.frozen:
-            steps = codetr.gradient_steps if self._fitted else codetr.first_gradient_steps
+        steps = method.schedule.each if self._fitted else method.schedule.first
         if steps and not len(memory.segment_ids()):
             self._counters['gradient steps skipped, nothing scored'] += steps
             return
@@ -116,33 +112,22 @@ class Labeller(Consumer):
         """Label what is new or has changed; a slice is one forward pass."""
         ids = memory.segment_ids()
         fresh = np.setdiff1d(ids, self._labelled, assume_unique=True)
-        todo = fresh if method.frozen or method.version == self._labelled_version else ids
-        for i in range(0, len(todo), self._settings.codetr.label_batch):
-            some = todo[i : i + self._settings.codetr.label_batch]
+        todo = fresh if method.version == self._labelled_version else ids
+        for i in range(0, len(todo), method.label_batch):
+            some = todo[i : i + method.label_batch]
             passes = []
-            for labels in self._passes(memory, method, some):
+            for labels in method.label_passes(memory, some):
                 passes.append(labels)
                 yield []
             joined = np.concatenate(passes)
             if not np.isfinite(joined).all():
                 raise rewards.RewardModelError(
-                    f'labels are not finite after {method.version} gradient steps: training has '
-                    'diverged. Lower codetr.learning_rate, or set target_scale=rms'
+                    f'labels of method {method.name!r} are not finite after '
+                    f'{method.gradient_steps} gradient steps: training has diverged. '
+                    'Lower its learning_rate, or set target_scale=rms'
                 )
             yield self._records(phase, memory, some, joined, method.version)
         self._labelled, self._labelled_version = ids, method.version
-
-    def _passes(
-        self, memory: Trajectories, method: rewards.RewardMethod, ids: I64
-    ) -> Iterator[F32]:
-        """Labels of segments one after the other, (sum of lengths,) in all, pass by pass."""
-        codetr = self._settings.codetr
-        if codetr.labelling == 'window' and not method.frozen:
-            for batch in memory.windows(ids, codetr.window, codetr.label_batch):
-                yield method.label_windows(batch)
-        else:
-            batch = memory.segment_batch(ids, method.context)
-            yield method.label(batch)[segment_steps(batch)]
 
     def _records(
         self, phase: int, memory: Trajectories, ids: I64, labels: F32, version: int
@@ -220,6 +205,6 @@ class Labeller(Consumer):
         """Counts and the digest of the reward model, for the run's summary."""
         said = super().report()
         if self._method is not None:
-            said['gradient_steps'] = self._method.version
+            said['gradient_steps'] = self._method.gradient_steps
             said['reward_model_sha256'] = checkpoints.digest(self._method.state())
         return said

@@ -5,8 +5,8 @@ in slices.
 
 Nothing is learnt in a callback and no thread spins beside the learner. A node answers (signals,
 parameters, its presence) between two slices, so within the length of one: `sac.burst` updates in
-the learner, one gradient step or `codetr.label_batch` segments in the reward node, one chunk in a
-simulator, one episode in the evaluator. While it waits it answers within 50 ms.
+the learner, one gradient step or the labels of some hundred segments in the reward node, one chunk
+in a simulator, one episode in the evaluator. While it waits it answers within 50 ms.
 """
 
 import gc

@@ -1,0 +1,179 @@
+"""One attempt at a cell: a process of its own, `codetr train --in-process`, and what it made.
+
+Local workers and Ray workers do the same thing with it, so that a cell is the same wherever it
+ran.
+"""
+
+import errno
+import json
+import os
+import secrets
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from codetr_ros import launcher, run_folder
+from codetr_ros.benchmark.folder import Folder, finished, provenance, read_json
+from codetr_ros.run_folder import atomic_write
+
+ERROR_LINES = 15
+"""Lines of its log that a failed cell is reported with."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a worker must know of a cell.
+
+    Attributes:
+        cell: its name.
+        settings_hash: the hash of its settings.
+        steps: environment steps of its run.
+        phases: phases of its run.
+        threads: threads that it takes.
+    """
+
+    cell: str
+    settings_hash: str
+    steps: int
+    phases: int
+    threads: int
+
+
+class Attempt:
+    """A run of a cell that has been started.
+
+    Its process is killed when whoever started it dies: the thread that made this object must live
+    as long as the attempt.
+
+    Args:
+        folder: the benchmark's folder.
+        job: the cell.
+    """
+
+    def __init__(self, folder: Folder, job: Job) -> None:
+        self.job = job
+        self._folder = folder
+        self._place = folder.attempts / f'{job.cell}.{secrets.token_hex(4)}'
+        self._log = self._place.with_name(f'{self._place.name}.log')
+        self._began = time.monotonic()
+        command = [sys.executable, '-m', 'codetr_ros.cli', 'train', '--in-process']
+        command += ['--config', str(folder.settings(job.cell)), '--out', str(self._place)]
+        with self._log.open('wb') as log:
+            log.write(f'$ {shlex.join(command)}\n'.encode())
+            log.flush()
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, 'PYTHONUNBUFFERED': '1'},
+                start_new_session=True,  # Ctrl-C reaches only us
+                # one system call, looked up before
+                preexec_fn=launcher.end_with_parent(signal.SIGKILL),  # noqa: PLW1509
+            )
+
+    @property
+    def over(self) -> bool:
+        """Whether the process has ended."""
+        return self._process.poll() is not None
+
+    @property
+    def seconds(self) -> float:
+        """Since its start."""
+        return time.monotonic() - self._began
+
+    def phases(self) -> int:
+        """Phases learnt from so far, as its checkpoints say; 0 in the warm-up."""
+        return phases_in(self._place)
+
+    def finish(self) -> dict[str, Any]:
+        """Put what an ended process has made into the cell's place.
+
+        Returns:
+            How it ended, as kept in `cells/<cell>.json`: `error` is None for a finished cell.
+        """
+        code, job, folder = self._process.wait(), self.job, self._folder
+        summary = read_json(self._place / run_folder.SUMMARY)
+        done = code == 0 and finished(summary, job.settings_hash)
+        ending = {
+            'cell': job.cell,
+            'settings_hash': job.settings_hash,
+            'error': None if done else self._why(code, summary),
+            'exit_code': code,
+            'log': None if done else launcher.end_of_log(self._log, ERROR_LINES),
+            'wall_s': round(self.seconds, 3),
+            **provenance(),
+        }
+        if not self._move_into_place():
+            self._remove()  # somebody was quicker; theirs stays
+            return read_json(folder.ending(job.cell)) or ending
+        os.replace(self._log, folder.log(job.cell))
+        atomic_write(folder.ending(job.cell), json.dumps(ending, indent=1) + '\n')
+        return ending
+
+    def discard(self) -> None:
+        """End the process at once and remove what it has made."""
+        if not self.over:
+            # not yet waited for, so its number cannot be anybody else's by now
+            os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait()
+        self._remove()
+
+    def _move_into_place(self) -> bool:
+        """Whether the cell's place now holds this run, or nothing where it made no folder."""
+        folder, cell = self._folder, self.job.cell
+        if not self._place.is_dir():
+            return folder.state(cell, self.job.settings_hash) != 'finished'
+        try:
+            self._place.rename(folder.run(cell))
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
+                raise
+            if folder.state(cell, self.job.settings_hash) == 'finished':
+                return False
+            folder.set_aside(cell)
+            self._place.rename(folder.run(cell))
+        run_folder.sync_folder(folder.path)
+        return True
+
+    def _why(self, code: int, summary: dict[str, Any] | None) -> str:
+        if summary and summary.get('failure'):
+            return str(summary['failure'])
+        if code < 0:
+            try:
+                return f'ended by {signal.Signals(-code).name}'
+            except ValueError:
+                return f'ended by signal {-code}'
+        if code:
+            return f'ended with exit code {code}'
+        if summary is None:
+            return f'ended with exit code 0 but left no {run_folder.SUMMARY}'
+        return (
+            f'ended with exit code 0 but its {run_folder.SUMMARY} is of an unfinished run or of '
+            f'other settings (hash {summary.get("settings_hash")}, not {self.job.settings_hash})'
+        )
+
+    def _remove(self) -> None:
+        shutil.rmtree(self._place, ignore_errors=True)
+        self._log.unlink(missing_ok=True)
+
+
+def phases_in(run: Path) -> int:
+    """Phases that the learner of a run has saved a checkpoint of; 0 where there is none."""
+    numbers = [
+        path.name.removeprefix('learner-')
+        for path in (run / run_folder.CHECKPOINTS).glob('learner-*')
+    ]
+    return max((int(number) + 1 for number in numbers if number.isdigit()), default=0)
+
+
+def running(folder: Folder, cell: str) -> Path | None:
+    """The folder of the newest attempt at a cell, where there is one."""
+    found = [p for p in folder.attempts.glob(f'{cell}.????????') if p.is_dir()]
+    return max(found, key=lambda path: path.stat().st_mtime, default=None)

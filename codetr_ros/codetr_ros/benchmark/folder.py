@@ -1,0 +1,299 @@
+"""The folder of a benchmark: what lies where, and what state each cell is in.
+
+    spec.yaml                the spec, every setting spelt out; `codetr benchmark run` takes it
+    benchmark.json           all cells with the hash of their settings; where and when it was run
+    cells/<cell>.yaml        the cell's settings
+    cells/<cell>.log         what its last run printed
+    cells/<cell>.json        how its last run ended
+    <cell>/                  the folder of its run, once it has ended
+    attempts/                runs that have not ended
+    aside/                   what lay in the place of a cell without having been finished
+
+A run works in `attempts/`, under a name that no other run has, and is renamed into its place when
+it has ended: so a cell is there whole or not at all, and whoever outlives its runner writes into
+no place that matters.
+"""
+
+import fcntl
+import json
+import os
+import platform
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from codetr_ros import run_folder
+from codetr_ros.benchmark.spec import BenchmarkError, Cell, Spec
+from codetr_ros.run_folder import atomic_write
+from codetr_ros.summary import versions
+
+SPEC = 'spec.yaml'
+INDEX = 'benchmark.json'
+CELLS = 'cells'
+ATTEMPTS = 'attempts'
+ASIDE = 'aside'
+FORMAT = 1
+
+State = Literal['finished', 'failed', 'missing']
+
+
+def finished(summary: Mapping[str, Any] | None, settings_hash: str) -> bool:
+    """Whether a run's summary says that all of it was done, under the settings of this hash."""
+    return bool(
+        summary
+        and summary.get('settings_hash') == settings_hash
+        and summary.get('steps') == summary.get('steps_planned')
+        and not summary.get('interrupted')
+        and not summary.get('failure')
+    )
+
+
+def read_json(path: Path) -> dict[str, Any] | None:
+    """The JSON object in a file; None where there is no file or no such object in it."""
+    try:
+        found = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return None
+    return found if isinstance(found, dict) else None
+
+
+class Folder:
+    """The folder of one benchmark.
+
+    Args:
+        path: the folder; need not exist yet.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path.absolute()
+
+    def settings(self, cell: str) -> Path:
+        """The cell's settings."""
+        return self.path / CELLS / f'{cell}.yaml'
+
+    def log(self, cell: str) -> Path:
+        """What its last run printed."""
+        return self.path / CELLS / f'{cell}.log'
+
+    def ending(self, cell: str) -> Path:
+        """How its last run ended."""
+        return self.path / CELLS / f'{cell}.json'
+
+    def run(self, cell: str) -> Path:
+        """Its run's folder."""
+        return self.path / cell
+
+    @property
+    def attempts(self) -> Path:
+        """Where runs work."""
+        return self.path / ATTEMPTS
+
+    def summary(self, cell: str) -> dict[str, Any] | None:
+        """The summary of the cell's run, if there is one."""
+        return read_json(self.run(cell) / run_folder.SUMMARY)
+
+    def state(self, cell: str, settings_hash: str) -> State:
+        """What has become of a cell whose settings have this hash."""
+        if finished(self.summary(cell), settings_hash):
+            return 'finished'
+        said = read_json(self.ending(cell))
+        failed = said and said['settings_hash'] == settings_hash and said['error']
+        return 'failed' if failed else 'missing'
+
+    def error(self, cell: str) -> str:
+        """Why the cell's last run failed, in a line."""
+        said = read_json(self.ending(cell))
+        return str(said['error']) if said and said['error'] else 'unknown'
+
+    def index(self) -> dict[str, Any]:
+        """What `benchmark.json` says.
+
+        Raises:
+            BenchmarkError: there is none, so this is not the folder of a benchmark, or it is
+                damaged.
+        """
+        path = self.path / INDEX
+        if not path.is_file():
+            raise BenchmarkError(
+                f'{self.path} is not the folder of a benchmark, it has no {INDEX}: '
+                'give the folder that `codetr benchmark run` was given with --out'
+            )
+        found = read_json(path)
+        if found is None or found.get('format') != FORMAT:
+            raise BenchmarkError(
+                f'{path} is damaged or of another version: it must be a JSON object with '
+                f'format {FORMAT}'
+            )
+        return found
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Keep every other runner out of this folder.
+
+        Raises:
+            BenchmarkError: one is in it.
+        """
+        self.path.mkdir(parents=True, exist_ok=True)
+        handle = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise BenchmarkError(
+                f'{self.path}: another `codetr benchmark run` is at work there: wait for it, '
+                'or choose another folder with --out'
+            ) from None
+        else:
+            yield
+        finally:
+            os.close(handle)
+
+    def check(self, spec: Spec) -> None:
+        """Refuse a folder that holds anything but this benchmark, or the beginnings of it.
+
+        Raises:
+            BenchmarkError: it is of another spec, with cells that this one lacks or has under
+                other settings; or it is not of a benchmark at all.
+        """
+        if not (self.path / INDEX).is_file():
+            try:
+                run_folder.check(self.path)
+            except run_folder.RunFolderError as error:
+                raise BenchmarkError(str(error)) from None
+            return
+        new = {cell.name: cell for cell in spec.cells}
+        there: dict[str, dict[str, Any]] = self.index()['cells']
+        if lacking := [name for name in there if name not in new]:
+            raise BenchmarkError(
+                f'{self.path} was made by another spec: it has {len(lacking)} cells that this '
+                f'one lacks ({", ".join(lacking[:3])}{", ..." if len(lacking) > 3 else ""}). A '
+                'spec may only add cells; choose another folder with --out'
+            )
+        for name, row in there.items():
+            if row['settings_hash'] != new[name].settings.hash():
+                raise BenchmarkError(
+                    f'{self.path} was made by another spec: cell {name} has other settings there '
+                    f'({self._difference(new[name])}). A spec may only add cells; choose another '
+                    'folder with --out'
+                )
+
+    def _difference(self, cell: Cell) -> str:
+        """The settings in which the cell differs from what lies in the folder."""
+        path = self.settings(cell.name)
+        try:
+            there = yaml.safe_load(path.read_text())
+        except (OSError, yaml.YAMLError) as error:
+            return f'{path} cannot be read: {error}'
+        before = dict(_flat(there if isinstance(there, dict) else {}))
+        now = dict(_flat(cell.settings.model_dump(mode='json')))
+        names = [name for name in {**before, **now} if before.get(name) != now.get(name)]
+        shown = [f'{n}: {before.get(n)!r} there, {now.get(n)!r} here' for n in names[:4]]
+        return '; '.join(shown) + ('; ...' if len(names) > 4 else '')
+
+    def prepare(self, spec: Spec, session: Mapping[str, Any]) -> None:
+        """Write down what is to be run and by whom.
+
+        Args:
+            spec: the benchmark, checked.
+            session: who runs it, where and how; kept beside those before.
+        """
+        (self.path / CELLS).mkdir(exist_ok=True)
+        self.attempts.mkdir(exist_ok=True)
+        before = self.index()['sessions'] if (self.path / INDEX).is_file() else []
+        cells = {}
+        for cell in spec.cells:
+            cells[cell.name] = _row(cell)
+            path = self.settings(cell.name)
+            text = yaml.safe_dump(cell.settings.model_dump(mode='json'), sort_keys=False)
+            if not path.is_file() or path.read_text() != text:
+                atomic_write(path, text)
+        index = {'format': FORMAT, 'cells': cells, 'sessions': [*before, dict(session)]}
+        atomic_write(self.path / SPEC, spec.to_yaml())
+        atomic_write(self.path / INDEX, json.dumps(index, indent=1) + '\n')
+
+    def clear_attempts(self) -> int:
+        """Remove what runners that are gone have left unfinished; how many runs."""
+        left = list(self.attempts.iterdir())
+        for path in left:
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+        return sum(path.suffix == '.log' for path in left)  # one for each
+
+    def set_aside(self, cell: str) -> Path | None:
+        """Move away what lies in the cell's place, if anything; where to."""
+        place = self.run(cell)
+        if not place.exists():
+            return None
+        (self.path / ASIDE).mkdir(exist_ok=True)
+        number = 1
+        while (aside := self.path / ASIDE / f'{cell}.{number}').exists():
+            number += 1
+        place.rename(aside)
+        return aside
+
+
+def _row(cell: Cell) -> dict[str, Any]:
+    names = ('task', 'composite', 'delay', 'method', 'seed', 'steps')
+    settings = cell.settings.model_dump(mode='json', include=set(names))
+    return {name: settings[name] for name in names} | {'settings_hash': cell.settings.hash()}
+
+
+def _flat(data: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
+    for name, value in data.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f'{prefix}{name}.')
+        else:
+            yield f'{prefix}{name}', value
+
+
+def session(spec: Path, workers: int) -> dict[str, Any]:
+    """Who runs a benchmark: versions, commit, machine, time."""
+    return {
+        'began': time.strftime('%Y-%m-%dT%H:%M:%S%z'),
+        'spec': str(spec),
+        'workers': workers,
+        **provenance(),
+    }
+
+
+def provenance() -> dict[str, Any]:
+    """Commit (None outside a git checkout; `+changes` where files differ from it), machine and
+    versions.
+    """
+    return {
+        'commit': _commit(Path(__file__).parent),
+        'machine': {'cpu': _cpu(), 'cores': os.cpu_count()},
+        'versions': versions(),
+    }
+
+
+def _commit(folder: Path) -> str | None:
+    def git(*arguments: str) -> str | None:
+        try:
+            done = subprocess.run(
+                ['git', '-C', str(folder), *arguments], capture_output=True, text=True, check=True
+            )
+        except (OSError, subprocess.CalledProcessError):
+            return None
+        return done.stdout.strip()
+
+    commit = git('rev-parse', 'HEAD')
+    if commit is None or git('ls-files', '--', str(folder)) in (None, ''):
+        return None  # some other checkout that happens to be around an installed package
+    return commit + ('+changes' if git('status', '--porcelain', '--', str(folder.parent)) else '')
+
+
+def _cpu() -> str:
+    try:
+        lines = Path('/proc/cpuinfo').read_text().splitlines()
+    except OSError:
+        lines = []
+    names = [line.split(':', 1)[1].strip() for line in lines if line.startswith('model name')]
+    return names[0] if names else platform.processor() or platform.machine()

@@ -1,0 +1,153 @@
+"""How a benchmark is doing: a display that changes in place on a terminal, else plain lines."""
+
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from types import TracebackType
+from typing import Any, TextIO
+
+from rich.console import Console, RenderableType
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from codetr_ros.benchmark.attempt import Job, phases_in, running
+from codetr_ros.benchmark.folder import Folder
+from codetr_ros.progress import duration
+
+_PLAIN_EVERY = 30.0  # seconds between plain lines while nothing ends
+_LIVE_EVERY = 0.5  # seconds between changes of the display
+
+
+class Overview:
+    """Shows which cells are done, run, have failed, and how long it will take.
+
+    Args:
+        folder: the benchmark's folder.
+        jobs: the cells to be run.
+        done: how many were finished before.
+        stream: where to show it.
+        live: change the display in place; by default if `stream` is a terminal.
+        clock: seconds, never going back.
+    """
+
+    def __init__(
+        self,
+        folder: Folder,
+        jobs: Sequence[Job],
+        done: int,
+        stream: TextIO | None = None,
+        live: bool | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._folder = folder
+        self._stream = stream or sys.stdout
+        self._console = Console(file=self._stream)
+        wanted = self._console.is_terminal if live is None else live
+        self._live = Live(console=self._console, auto_refresh=False) if wanted else None
+        self._clock = clock
+        self._began = self._shown = clock()
+        self._total = len(jobs) + done
+        self._steps_total = sum(job.steps for job in jobs)
+        self._steps_done = 0  # of cells that have ended since the beginning, failed ones included
+        self._done = done
+        self._running: dict[str, tuple[Job, float]] = {}  # by cell, with its start
+        self.failed: dict[str, str] = {}
+        """Cells that failed, and why."""
+
+    def __enter__(self) -> 'Overview':
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._live is not None:
+            self._live.update(self._render(), refresh=True)
+            self._live.stop()
+
+    def say(self, text: str, style: str = '') -> None:
+        """Show a line above the display, to stay."""
+        self._console.print(Text(text, style=style), soft_wrap=True)
+        self._stream.flush()
+
+    def started(self, job: Job) -> None:
+        """A cell begins; one that begins again is counted once."""
+        self._running[job.cell] = (job, self._clock())
+        if self._live is None:
+            self.say(f'begun: {job.cell}')
+
+    def ended(self, job: Job, ending: Mapping[str, Any]) -> None:
+        """A cell has ended, as `Attempt.finish` says."""
+        _, began = self._running.pop(job.cell)
+        self._steps_done += job.steps
+        took = duration(self._clock() - began)
+        if ending['error'] is None:
+            self._done += 1
+            self.say(f'done: {job.cell} in {took} ({self._counts()})')
+            return
+        self.failed[job.cell] = ending['error']
+        self.say(f'FAILED: {job.cell} after {took}: {ending["error"]}', 'bold red')
+        for line in (ending['log'] or '').splitlines():
+            self.say(f'    {line}', 'dim')
+
+    def tick(self) -> None:
+        """Show how things are, if it is time."""
+        now = self._clock()
+        if now - self._shown < (_PLAIN_EVERY if self._live is None else _LIVE_EVERY):
+            return
+        self._shown = now
+        if self._live is None:
+            shown = ', '.join(f'{cell} {share:.0%}' for cell, share, _ in self._progress())
+            self.say(self._counts() + (f'; running: {shown}' if shown else ''))
+        else:
+            self._live.update(self._render(), refresh=True)
+
+    def _progress(self) -> list[tuple[str, float, float]]:
+        """Each running cell with the share of its phases learnt from and its seconds so far."""
+        found = []
+        for cell, (job, began) in self._running.items():
+            place = running(self._folder, cell)
+            share = phases_in(place) / job.phases if place else 0.0
+            found.append((cell, min(share, 1.0), self._clock() - began))
+        return found
+
+    def _steps(self) -> float:
+        shares = {cell: share for cell, share, _ in self._progress()}
+        return self._steps_done + sum(
+            job.steps * shares[cell] for cell, (job, _) in self._running.items()
+        )
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Estimate from the steps per second since the beginning; None while there are none."""
+        steps, spent = self._steps(), self._clock() - self._began
+        return (self._steps_total - steps) * spent / steps if steps and spent else None
+
+    def _counts(self) -> str:
+        left = self.seconds_left
+        counts = [f'{self._done} of {self._total} done', f'{len(self._running)} running']
+        counts.append(f'{len(self.failed)} failed')
+        counts.append(f'{duration(self._clock() - self._began)} so far')
+        if left:
+            counts.append(f'about {duration(left)} left')
+        return ', '.join(counts)
+
+    def _render(self) -> RenderableType:
+        whole = Table.grid()
+        whole.add_row(ProgressBar(total=self._total, completed=self._done, width=60))
+        whole.add_row(Text(self._counts()))
+        cells = Table.grid(padding=(0, 2))
+        for cell, share, seconds in self._progress():
+            bar = ProgressBar(total=1.0, completed=share, width=20)
+            cells.add_row(Text(cell), bar, Text(f'{share:.0%}'), Text(duration(seconds)))
+        whole.add_row(cells)
+        if self.failed:
+            text = f'failed: {", ".join(self.failed)}'
+            whole.add_row(Text(text, style='bold red'))
+        return whole

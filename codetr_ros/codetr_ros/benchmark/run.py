@@ -1,0 +1,88 @@
+"""Running a benchmark: what is still to be done, done, with an overview."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from codetr_ros.benchmark import pool
+from codetr_ros.benchmark.attempt import Job
+from codetr_ros.benchmark.folder import Folder, session
+from codetr_ros.benchmark.overview import Overview
+from codetr_ros.benchmark.spec import Spec
+
+
+def run(
+    spec: Spec,
+    path: Path,
+    out: Path,
+    workers: int,
+    retry_failed: bool,
+    stopped: Callable[[], bool],
+) -> dict[str, str]:
+    """Run every cell that is not finished.
+
+    Args:
+        spec: the benchmark.
+        path: the file that it was read from.
+        out: its folder.
+        workers: cells at a time.
+        retry_failed: run failed cells again.
+        stopped: whether somebody wants to stop.
+
+    Returns:
+        The cells that have failed, now or before, and why.
+
+    Raises:
+        BenchmarkError: another spec's folder, another runner in it.
+    """
+    folder = Folder(out)
+    folder.check(spec)
+    with folder.alone():
+        folder.check(spec)  # nobody has changed it meanwhile, and nobody can from here on
+        folder.prepare(spec, session(path, workers))
+        left = folder.clear_attempts()
+        jobs, failed = _todo(spec, folder, retry_failed)
+        done = len(spec.cells) - len(jobs) - len(failed)
+        overview = Overview(folder, jobs, done)
+        overview.say(
+            f'{len(spec.cells)} cells: {done} finished before, {len(failed)} failed before, '
+            f'{len(jobs)} to be run'
+        )
+        if left:
+            overview.say(f'{left} runs that an earlier runner left unfinished were removed')
+        if failed:
+            overview.say('cells that failed before are run again with --retry-failed')
+        for job in jobs:
+            if (aside := folder.set_aside(job.cell)) is not None:
+                overview.say(f'{job.cell} is not finished: what was there is now {aside}')
+        with overview:
+            _warn(jobs, workers, overview)
+            pool.run(folder, jobs, workers, overview, stopped)
+    return failed | overview.failed
+
+
+def _todo(spec: Spec, folder: Folder, retry_failed: bool) -> tuple[list[Job], dict[str, str]]:
+    """The cells to be run, and those that have failed before and are not to be run again."""
+    jobs: list[Job] = []
+    failed: dict[str, str] = {}
+    for cell in spec.cells:
+        settings = cell.settings
+        state = folder.state(cell.name, settings.hash())
+        if state == 'failed' and not retry_failed:
+            failed[cell.name] = folder.error(cell.name)
+        elif state != 'finished':
+            jobs.append(
+                Job(cell.name, settings.hash(), settings.steps, settings.phases, settings.threads)
+            )
+    return jobs, failed
+
+
+def _warn(jobs: list[Job], workers: int, overview: Overview) -> None:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count()
+    threads = max((job.threads for job in jobs), default=1)
+    if cores is not None and workers * threads > cores:
+        overview.say(
+            f'{workers} workers with {threads} threads each on {cores} cores: they will wait for '
+            'each other; give fewer --workers, or lower config.threads in the spec',
+            'yellow',
+        )

@@ -1,0 +1,83 @@
+"""`codetr benchmark`: many runs under one protocol, and the table that they make."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from codetr_ros.cli import FAILED, INTERRUPTED, refuse
+from codetr_ros.cli.supervise import Interrupts
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """Run every cell of a benchmark that is not finished yet.
+
+    A cell is one run in process, of one method, task, composite reward, delay and seed: the spec
+    lists them, and all combinations are run. Stopped or killed, the same command goes on where it
+    was: finished cells are kept, unfinished ones begin again. Exit code 1: a cell has failed.
+    """
+
+    spec: Annotated[
+        str,
+        tyro.conf.Positional,
+        tyro.conf.arg(
+            metavar='SPEC.yaml',
+            help='keys: methods, tasks, composites, delays, seeds, steps, and optionally config: '
+            'a preset or file, or settings, with `base` for the preset or file they change',
+        ),
+    ]
+    out: Annotated[str, tyro.conf.arg(metavar='DIR', help="the benchmark's folder")]
+    workers: Annotated[
+        int,
+        tyro.conf.arg(
+            metavar='N', help='cells at a time, each with as many threads as its settings say'
+        ),
+    ] = 1
+    retry_failed: Annotated[
+        bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help='run failed cells again')
+    ] = False
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the benchmark's part that the command line names; the exit code."""
+    return tyro.extras.subcommand_cli_from_dict(
+        {'run': _run},
+        prog='codetr benchmark',
+        description='Many runs under one protocol, and the table that they make.',
+        args=arguments,
+    )
+
+
+def _run(given: Annotated[Run, tyro.conf.OmitArgPrefixes]) -> int:
+    from codetr_ros.benchmark import run, spec
+
+    if given.workers < 1:
+        return refuse(f'--workers {given.workers}: at least 1')
+    path, out = Path(given.spec), Path(given.out)
+    with Interrupts() as interrupts:
+        try:
+            failed = run.run(
+                spec.load(path),
+                path,
+                out,
+                given.workers,
+                given.retry_failed,
+                lambda: interrupts.count > 0,
+            )
+        except spec.BenchmarkError as error:
+            return refuse(str(error))
+    if interrupts.count:
+        print(
+            f'stopped: what has ended is kept; the same command goes on (codetr benchmark run '
+            f'{given.spec} --out {given.out})'
+        )
+        return INTERRUPTED
+    if failed:
+        print(f'{len(failed)} cells have failed:')
+        for cell, why in failed.items():
+            print(f'  {cell}: {why}')
+        print(f'their logs: {out}/cells/<cell>.log; --retry-failed runs them again')
+    return FAILED if failed else 0

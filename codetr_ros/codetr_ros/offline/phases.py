@@ -1,0 +1,151 @@
+"""`codetr fit --schedule phases`: what the reward node learnt in a run, learnt again from its bag.
+
+The bag says in `Commit`s what was learnt from, and when. Here the very core of the reward node is
+handed what the bag holds, in its order, and does its work after each commit as it did in the run:
+with the run's settings, on the same CPU and versions, it ends with the same weights, bit for bit.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from codetr_ros.config import Settings
+from codetr_ros.offline.errors import FitError
+from codetr_ros.offline.standin import Bag
+from codetr_ros.records import (
+    TOPICS,
+    Commit,
+    Metrics,
+    Record,
+    RecordError,
+    RunSpec,
+    StepRewards,
+)
+from codetr_ros.rewards.core import Labeller
+
+NODE = 'reward'
+"""Name under which the core speaks; nothing is learnt from it."""
+
+
+@dataclass
+class Recorded:
+    """The labels that the bag holds, compared with those made from it."""
+
+    same: int = 0  # segments
+    other: int = 0
+    _made: dict[tuple[int, str, int, int], bytes] = field(default_factory=dict)
+
+    def made(self, parts: StepRewards) -> None:
+        """Remember the labels made of one phase."""
+        self._made.update(_segments(parts))
+
+    def recorded(self, parts: StepRewards) -> None:
+        """Compare labels that were recorded."""
+        for key, labels in _segments(parts):
+            if self._made.get(key) == labels:
+                self.same += 1
+            else:
+                self.other += 1
+
+    def forget(self, before: int) -> None:
+        """Drop what was made before a phase: its recorded labels have come."""
+        self._made = {key: labels for key, labels in self._made.items() if key[0] >= before}
+
+
+@dataclass
+class Fold:
+    """What came out of folding a bag."""
+
+    core: Labeller
+    run: RunSpec
+    settings: Settings
+    phases: int  # learnt from or taken in
+    losses: list[tuple[int, float]]  # (gradient steps taken, mean loss of the phase)
+    refused: Counter[str]  # records that could not be taken in, by topic
+    recorded: Recorded
+
+
+def _segments(parts: StepRewards) -> Iterator[tuple[tuple[int, str, int, int], bytes]]:
+    ends = np.cumsum(parts.lengths, dtype=np.int64)
+    for episode, first, length, end in zip(
+        parts.episodes.tolist(),
+        parts.first_steps.tolist(),
+        parts.lengths.tolist(),
+        ends.tolist(),
+        strict=True,
+    ):
+        key = (parts.phase, parts.source, episode, first)
+        yield key, parts.labels[end - length : end].tobytes()
+
+
+def fold(
+    bag: Bag,
+    run: RunSpec,
+    settings: Settings,
+    folder: Path | None,
+    say: Callable[[str], None] = lambda text: None,
+    progress: Callable[[int, int], None] = lambda phase, phases: None,
+    **start: Any,
+) -> Fold:
+    """Learn from a run's bag phase by phase.
+
+    Args:
+        bag: the bag.
+        run: which of the bag's runs.
+        settings: the run's own, or changed ones: then what is learnt differs.
+        folder: where checkpoints go; None keeps none.
+        say: is told what was refused, and why.
+        progress: is told the phases that are done, and how many the run has.
+        start: `checkpoint` and `frozen` of `Labeller`, if the run had them.
+
+    Raises:
+        FitError: something that a commit names is not in the bag.
+    """
+    torch.set_num_threads(settings.threads)
+    core = Labeller(run, settings, NODE, folder, **start)
+    found = Fold(core, run, settings, 0, [], core.refused, Recorded())
+    kinds = (*core.subscribes, StepRewards)
+    work = core.work()
+    for entry in bag.entries(kinds):
+        record = entry.record
+        if record.run_id != run.run_id:
+            continue
+        if isinstance(record, StepRewards):
+            found.recorded.recorded(record)
+            continue
+        try:
+            core.receive(record)
+        except RecordError as error:  # as in the run: refused, said, counted
+            found.refused[TOPICS[entry.kind]] += 1
+            say(f'{entry.place}: {error}')
+        if isinstance(record, Commit):
+            _work(work, found)
+            if core.missing is not None:
+                raise FitError(
+                    f'{bag.path}: phase {core.missing} of run {run.run_id!r} is committed, but '
+                    f'not all that belongs to it is in the bag: {found.phases} phases were '
+                    'folded. `codetr bag verify` says what is missing; --schedule epochs fits '
+                    'on what is there'
+                )
+            found.phases = record.phase + 1
+            found.recorded.forget(record.phase - settings.lag)
+            progress(found.phases, settings.phases)
+    core.close()
+    return found
+
+
+def _work(work: Iterator[list[Record] | None], found: Fold) -> None:
+    """Let the core do all that it can."""
+    while (records := next(work)) is not None:
+        for record in records:
+            if isinstance(record, StepRewards):
+                found.recorded.made(record)
+            elif isinstance(record, Metrics):
+                said = dict(zip(record.names, record.values.tolist(), strict=True))
+                if 'reward_loss' in said:
+                    found.losses.append((int(said['gradient_steps']), said['reward_loss']))

@@ -1,0 +1,58 @@
+"""The bags that a command was given, and the runs that they say they are of."""
+
+from pathlib import Path
+
+from codetr_ros import run_folder
+from codetr_ros.config import Settings, from_canonical
+from codetr_ros.offline.errors import FitError
+from codetr_ros.offline.standin import Bag
+from codetr_ros.records import RunSpec
+
+
+def open_bag(path: Path) -> Bag:
+    """A bag by its folder or file, or by the folder of the run that recorded it.
+
+    Raises:
+        BagError: there is none, or it cannot be read.
+    """
+    inside = path / run_folder.BAG
+    return Bag(inside if (path / run_folder.CONFIG).is_file() and inside.is_dir() else path)
+
+
+def runs_of(bag: Bag) -> list[RunSpec]:
+    """The runs that a bag says it holds, in its order."""
+    found: dict[str, RunSpec] = {}
+    for entry in bag.entries((RunSpec,)):
+        assert isinstance(entry.record, RunSpec)
+        found.setdefault(entry.record.run_id, entry.record)
+    return list(found.values())
+
+
+def one_run(bag: Bag, run_id: str | None) -> RunSpec:
+    """The run of a bag; of several the one with this id.
+
+    Raises:
+        FitError: there is none, or nobody said which.
+    """
+    runs = runs_of(bag)
+    names = ', '.join(run.run_id for run in runs)
+    if not runs:
+        raise FitError(
+            f'{bag.path} holds no RunSpec, so nobody knows how its run learnt: '
+            'fit it with --schedule epochs'
+        )
+    if run_id is None and len(runs) > 1:
+        raise FitError(f'{bag.path} holds the runs {names}: say which one with --run')
+    for run in runs:
+        if run_id in (None, run.run_id):
+            return run
+    raise FitError(f'{bag.path} holds no run {run_id!r}; it holds {names}')
+
+
+def settings_of(run: RunSpec, bag: Bag) -> Settings:
+    """The settings of a run, as its bag has them.
+
+    Raises:
+        SettingsError: this version does not know one of them.
+    """
+    return from_canonical(run.settings, f'run {run.run_id!r} in {bag.path}')

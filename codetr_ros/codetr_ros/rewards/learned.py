@@ -1,0 +1,185 @@
+"""What the methods with a network share: targets in units of c, standardised inputs, AdamW."""
+
+import math
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from codetr_ros.config import CodetrSettings, PerceptronSettings, Settings
+from codetr_ros.records import F32, F64
+from codetr_ros.rewards.method import (
+    RewardMethod,
+    RewardModelError,
+    Schedule,
+    segment_steps,
+)
+from codetr_ros.seeding import seed_torch
+from codetr_ros.trajectories import SegmentBatch, Trajectories
+
+STD_FLOOR = 1e-2
+"""Least standard deviation by which an observation component is divided (decided here).
+
+A component that stood still in the warm-up may move later: it must not drown the others then.
+"""
+
+
+class Learned(RewardMethod):
+    """A method that fits a network to composite rewards by gradient steps.
+
+    Inside, composite rewards are in units of the target scale c, the root mean square composite
+    reward per step of the warm-up: a positive constant, never a shift, so that what survival is
+    worth keeps its sign. The network sees observations standardised by the moments of the warm-up.
+
+    A subclass says what its network is, which terms its loss is the sum of, and which step
+    rewards it reads off.
+    """
+
+    group: ClassVar[str]
+    """The group of settings that it is trained by."""
+
+    def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
+        super().__init__(settings, observation_size, action_size)
+        self._own: CodetrSettings | PerceptronSettings = getattr(settings, self.group)
+        self._mean = torch.zeros(observation_size)
+        self._std = torch.ones(observation_size)
+        seed_torch(settings.seed, self.name, 'init')
+        self.network = self._make_network(observation_size, action_size)
+        self._optimiser = torch.optim.AdamW(
+            self.network.parameters(),
+            lr=self._own.learning_rate,
+            weight_decay=self._own.weight_decay,
+            fused=True,
+        )
+        for parameter in self.network.parameters():
+            # from the start, so that every state has the same tensors
+            self._optimiser.state[parameter] = {
+                'step': torch.zeros(()),
+                'exp_avg': torch.zeros_like(parameter),
+                'exp_avg_sq': torch.zeros_like(parameter),
+            }
+
+    @abstractmethod
+    def _make_network(self, observation_size: int, action_size: int) -> nn.Module:
+        """The network, with weights drawn from torch's global generator."""
+
+    @abstractmethod
+    def _terms(self, memory: Trajectories, rng: np.random.Generator) -> dict[str, Tensor]:
+        """The loss of one batch as scalars by name, whose sum is minimised."""
+
+    @abstractmethod
+    def _step_rewards(self, batch: SegmentBatch) -> Tensor:
+        """Step rewards (B, L) in units of c, of any value outside the segments."""
+
+    def _learning_rate(self) -> float:
+        """The learning rate of the next gradient step."""
+        return self._own.learning_rate
+
+    @property
+    def schedule(self) -> Schedule:
+        """Gradient steps of a phase, by the settings."""
+        return Schedule(self._own.first_gradient_steps, self._own.gradient_steps)
+
+    def prepare(self, memory: Trajectories) -> None:
+        """Freeze the target scale c and the moments of the observations, the first time."""
+        if self.target_scale:
+            return
+        super().prepare(memory)
+        if self._own.normalise_observations:
+            mean, std = memory.observation_moments()
+            self._mean = torch.tensor(mean, dtype=torch.float32)
+            self._std = torch.tensor(np.maximum(std, STD_FLOOR), dtype=torch.float32)
+
+    def gradient_step(self, memory: Trajectories, rng: np.random.Generator) -> dict[str, float]:
+        """One AdamW step on the loss of a batch.
+
+        Returns:
+            `reward_loss`, in units of c, and the method's other terms, before the step;
+            `learning_rate`: the one of this step.
+
+        Raises:
+            RewardModelError: not prepared, or training has diverged; no weight has changed.
+        """
+        self._require_prepared()
+        self.network.train()
+        terms = self._terms(memory, rng)
+        said = {name: float(term.detach()) for name, term in terms.items()}
+        for name, value in said.items():
+            if not math.isfinite(value):
+                raise RewardModelError(
+                    f'{name} is {value} at gradient step {self.gradient_steps}: training has '
+                    f'diverged. Lower {self.group}.learning_rate = {self._own.learning_rate} '
+                    f'or set target_scale = rms'
+                )
+        rate = self._learning_rate()
+        for group in self._optimiser.param_groups:
+            group['lr'] = rate
+        self._optimiser.zero_grad()
+        torch.stack(list(terms.values())).sum().backward()  # type: ignore[no-untyped-call]
+        self._optimiser.step()
+        self.gradient_steps += 1
+        return said | {'learning_rate': rate}
+
+    def label(self, batch: SegmentBatch) -> F32:
+        """Step rewards (B, L) of the segments' steps, 0 elsewhere."""
+        rewards = self._rewards(batch)
+        if self._settings.reward_unit == 'raw':
+            return rewards * np.float32(self.target_scale)
+        return rewards
+
+    def predict(self, batch: SegmentBatch) -> F64:
+        """The predicted composite rewards (B,), in the task's unit: sums of step rewards."""
+        predicted: F64 = self._rewards(batch).sum(1, dtype=np.float64) * self.target_scale
+        return predicted
+
+    def _rewards(self, batch: SegmentBatch) -> F32:
+        self._require_prepared()
+        self.network.eval()
+        with torch.inference_mode():
+            rewards: F32 = self._step_rewards(batch).numpy()
+        rewards[~segment_steps(batch)] = 0
+        return rewards
+
+    def _standardised(self, observations: F32) -> Tensor:
+        # torch.tensor copies into aligned memory: nothing may depend on where numpy's is
+        return (torch.tensor(observations) - self._mean) / self._std
+
+    def _scaled(self, values: F64) -> Tensor:
+        """Composite rewards (B,) in units of c."""
+        return torch.tensor(values / self.target_scale, dtype=torch.float32)
+
+    def state(self) -> dict[str, Tensor]:
+        """Weights, AdamW moments, gradient steps taken, target scale and observation moments."""
+        state = super().state() | {
+            'version': torch.tensor(self.gradient_steps, dtype=torch.int64),
+            'observation_mean': self._mean.clone(),
+            'observation_std': self._std.clone(),
+        }
+        for name, tensor in self._tensors().items():
+            state[name] = tensor.detach().clone()
+        return state
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Go on from a `state()`.
+
+        Raises:
+            RewardModelError: it is another method's or architecture's; nothing has changed then.
+        """
+        super().load_state(state)
+        self.gradient_steps = int(state['version'])
+        self._mean.copy_(state['observation_mean'])
+        self._std.copy_(state['observation_std'])
+        with torch.no_grad():
+            for name, tensor in self._tensors().items():
+                tensor.copy_(state[name])
+
+    def _tensors(self) -> dict[str, Tensor]:
+        found = {}
+        for name, parameter in self.network.named_parameters():
+            found[f'network.{name}'] = parameter.data
+            for moment, tensor in self._optimiser.state[parameter].items():
+                found[f'adamw.{moment}.{name}'] = tensor
+        return found

@@ -1,0 +1,53 @@
+"""A Markovian reward model: r(s, a) of each step by itself, trained on the sums of segments.
+
+It is a control, no published method: CoDeTr without a transformer and without weights. Where it
+does as well, no step's reward depended on the steps around it. Sizes, learning rate and weight
+decay are decided here, after the reward network of RRD; composite rewards, target scale,
+segments, batch and number of gradient steps are CoDeTr's.
+"""
+
+import itertools
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from codetr_ros.rewards.learned import Learned
+from codetr_ros.rewards.method import segment_steps
+from codetr_ros.trajectories import SegmentBatch, Trajectories
+
+
+class Mlp(Learned):
+    """Learns R(segment) = sum_t r(s_t, a_t) by regression; labels steps with r(s_t, a_t)."""
+
+    name: ClassVar[str] = 'mlp'
+    group: ClassVar[str] = 'mlp'
+
+    def _make_network(self, observation_size: int, action_size: int) -> nn.Module:
+        return perceptron(observation_size + action_size, self._settings.mlp.hidden)
+
+    def _terms(self, memory: Trajectories, rng: np.random.Generator) -> dict[str, Tensor]:
+        batch = memory.sample_segments(rng, self._settings.mlp.batch)
+        inside = torch.from_numpy(segment_steps(batch))  # (B, L)
+        predicted = (self._step_rewards(batch) * inside).sum(1)  # (B,)
+        return {'reward_loss': F.mse_loss(predicted, self._scaled(batch.values))}
+
+    def _step_rewards(self, batch: SegmentBatch) -> Tensor:
+        observations = self._standardised(batch.observations[:, :-1])  # (B, L, O)
+        inputs = torch.cat([observations, torch.tensor(batch.actions)], -1)  # (B, L, O + A)
+        rewards: Tensor = self.network(inputs).squeeze(-1)  # (B, L)
+        return rewards
+
+
+def perceptron(inputs: int, hidden: Sequence[int]) -> nn.Sequential:
+    """Linear layers with ReLU between them and one output; Xavier weights, zero biases."""
+    layers: list[nn.Module] = []
+    for before, after in itertools.pairwise((inputs, *hidden, 1)):
+        layer = nn.Linear(before, after)
+        nn.init.xavier_uniform_(layer.weight)
+        nn.init.zeros_(layer.bias)
+        layers += [layer, nn.ReLU()]
+    return nn.Sequential(*layers[:-1])

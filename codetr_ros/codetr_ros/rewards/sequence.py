@@ -1,0 +1,88 @@
+"""What the methods with a transformer over the steps of a window share: CoDeTr and RBT."""
+
+import math
+from collections.abc import Iterator
+from typing import ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from codetr_ros.config import CodetrSettings, Settings
+from codetr_ros.records import F32
+from codetr_ros.rewards.learned import Learned
+from codetr_ros.rewards.method import RewardModelError, segment_steps
+from codetr_ros.trajectories import SegmentBatch, Trajectories
+
+
+class SequenceMethod(Learned):
+    """A transformer that sees a segment with up to `context` steps of its episode before it.
+
+    Args:
+        settings: the run's settings; the initial weights depend on its seed.
+        observation_size: O.
+        action_size: A.
+        context: steps before a segment that the network sees in training as in labelling.
+        whole_window: whether these attend and are attended to within the sequence.
+    """
+
+    group: ClassVar[str] = 'codetr'
+
+    def __init__(
+        self,
+        settings: Settings,
+        observation_size: int,
+        action_size: int,
+        context: int,
+        whole_window: bool,
+    ) -> None:
+        self._codetr = settings.codetr
+        self.context = context
+        self.label_batch = settings.codetr.label_batch
+        self._whole_window = whole_window
+        self._positions = max(settings.delay + context, settings.codetr.window)
+        super().__init__(settings, observation_size, action_size)
+
+    def label_passes(self, memory: Trajectories, ids: NDArray[np.int64]) -> Iterator[F32]:
+        """Labels of the segments' steps, from whole segments or from windows (`labelling`)."""
+        if self._codetr.labelling == 'segment':
+            yield from super().label_passes(memory, ids)
+        else:
+            for batch in memory.windows(ids, self._codetr.window, self.label_batch):
+                yield self.label_windows(batch)
+
+    def label_windows(self, batch: SegmentBatch) -> F32:
+        """Step rewards (B,) of the last step of each window."""
+        labels = self.label(batch)
+        return labels[np.arange(len(labels)), batch.lengths - 1]
+
+    def _learning_rate(self) -> float:
+        return learning_rate(self._codetr, self.gradient_steps)
+
+    def _inputs(self, batch: SegmentBatch) -> tuple[Tensor, Tensor, Tensor]:
+        """Observations (B, L, O), actions (B, L, A) and who attends within the sequence (B, L)."""
+        step = np.arange(batch.actions.shape[1])
+        inside = step < batch.lengths[:, None] if self._whole_window else segment_steps(batch)
+        if len(step) > self._positions:
+            raise RewardModelError(
+                f'a window of {len(step)} steps: this model has places for {self._positions}, by '
+                f'delay = {self._settings.delay} and codetr.window = {self._codetr.window}'
+            )
+        observations = self._standardised(batch.observations[:, :-1])
+        return observations, torch.tensor(batch.actions), torch.from_numpy(inside)
+
+
+def learning_rate(settings: CodetrSettings, step: int) -> float:
+    """The learning rate of gradient step `step` (0, 1, ...).
+
+    It rises linearly over `warmup_gradient_steps`, the last of which has the full rate, then stays
+    there or falls on a half cosine to a tenth of it at `total_gradient_steps`, where it remains.
+    """
+    warmup = settings.warmup_gradient_steps
+    if step < warmup:
+        return settings.learning_rate * (step + 1) / warmup
+    if settings.schedule == 'constant':
+        return settings.learning_rate
+    progress = min(1.0, (step - warmup) / max(1, settings.total_gradient_steps - warmup))
+    return settings.learning_rate * (0.1 + 0.9 * 0.5 * (1 + math.cos(math.pi * progress)))

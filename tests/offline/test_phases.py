@@ -1,0 +1,104 @@
+"""What a run's reward model learnt is learnt again from its bag, bit for bit, without nodes."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from offline.bag_making import write
+
+from codetr_ros import checkpoints, cli
+from codetr_ros.records import Commit, RunSpec, StepRewards, Transitions
+
+DIGEST = 'reward_model_sha256'
+
+
+def fit(bag: Path, out: Path, *flags: str, code: int = 0) -> dict[str, Any]:
+    arguments = ['fit', str(bag), '--out', str(out), '--schedule', 'phases', *flags]
+    assert cli.main(arguments) == code
+    return json.loads((out / 'summary.json').read_text()) if code == 0 else {}
+
+
+def test_folding_the_bag_ends_with_the_weights_and_labels_of_the_run(a_run, tmp_path):
+    said = fit(a_run.bag, tmp_path / 'out')
+
+    assert said[DIGEST] == a_run.reports['reward'][DIGEST]
+    made = sum(len(r.lengths) for r in a_run.records if isinstance(r, StepRewards))
+    assert said['recorded_labels'] == {'same': made, 'other': 0}
+    assert said['phases'] == a_run.settings.phases
+    assert said['changed_settings'] == {}
+
+
+def test_the_last_checkpoint_holds_these_very_weights(a_run, tmp_path):
+    said = fit(a_run.bag, tmp_path / 'out')
+
+    newest = checkpoints.latest(tmp_path / 'out' / 'checkpoints', 'reward')
+    tensors, meta = checkpoints.load(newest)
+    assert checkpoints.digest(tensors) == said[DIGEST]
+    assert (meta['observation_size'], meta['action_size']) == (10, 2)
+    assert meta['settings'] == a_run.settings.canonical()
+
+
+def test_a_setting_that_the_run_did_not_have_is_said_and_teaches_something_else(a_run, tmp_path):
+    said = fit(a_run.bag, tmp_path / 'out', '--codetr.learning-rate', '0.002')
+
+    assert said['changed_settings'] == {'codetr.learning_rate': 0.002}
+    assert said[DIGEST] != a_run.reports['reward'][DIGEST]
+    assert said['recorded_labels']['same'] == 0
+
+
+def test_a_bag_cut_after_a_commit_is_folded_up_to_there(a_run, tmp_path):
+    ends = [i for i, r in enumerate(a_run.records) if isinstance(r, Commit)]
+    bag = write(tmp_path / 'cut', a_run.records[: ends[2] + 1])
+
+    assert fit(bag, tmp_path / 'out')['phases'] == 3
+
+
+def test_a_phase_that_is_not_whole_is_named_and_not_learnt_from(a_run, tmp_path, capsys):
+    records = list(a_run.records)
+    lost = next(i for i, r in enumerate(records) if isinstance(r, Transitions) and r.phase == 3)
+    del records[lost]
+    bag = write(tmp_path / 'bag', records)
+
+    fit(bag, tmp_path / 'out', code=2)
+
+    said = capsys.readouterr().err
+    assert "phase 3 of run 'calls' is committed, but not all that belongs to it" in said
+    assert '--schedule epochs' in said
+
+
+def test_two_runs_in_a_bag_must_be_told_apart(a_run, tmp_path, capsys):
+    other = a_run.settings.run_spec('other')
+    bag = write(tmp_path / 'bag', [*a_run.records, other])
+
+    fit(bag, tmp_path / 'out', code=2)
+    assert 'holds the runs calls, other: say which one with --run' in capsys.readouterr().err
+    fit(bag, tmp_path / 'out', '--run', 'mine', code=2)
+    assert "holds no run 'mine'; it holds calls, other" in capsys.readouterr().err
+    said = fit(bag, tmp_path / 'chosen', '--run', 'calls')
+    assert said[DIGEST] == a_run.reports['reward'][DIGEST]
+
+
+def test_a_bag_that_does_not_say_how_its_run_learnt_is_refused(a_run, tmp_path, capsys):
+    bag = write(tmp_path / 'bag', [r for r in a_run.records if not isinstance(r, RunSpec)])
+
+    fit(bag, tmp_path / 'out', code=2)
+
+    assert 'holds no RunSpec' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('flags', 'said'),
+    [
+        (['--config', 'cpu'], "--schedule phases learns under the run's own settings"),
+        (['--delay', '0'], 'delay = 0: Input should be greater than or equal to 1'),
+        (['--patience', '0'], 'patience = 0: Input should be greater than or equal to 1'),
+    ],
+)
+def test_flags_that_make_no_sense_are_refused_before_anything_is_made(
+    a_run, tmp_path, capsys, flags, said
+):
+    fit(a_run.bag, tmp_path / 'out', *flags, code=2)
+
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / 'out').exists()
