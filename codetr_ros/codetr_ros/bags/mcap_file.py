@@ -36,6 +36,8 @@ from codetr_ros.bags.mcap_layout import (
 )
 
 OnDamage = Callable[[Damage], None]
+LIBRARY = 'codetr_ros'
+"""What our recorder calls itself in a file."""
 
 
 class Channel(NamedTuple):
@@ -46,6 +48,7 @@ class Channel(NamedTuple):
     encoding: str  # of the messages: 'cdr'
     definition: Definition
     qos: str  # as YAML text, as the bag has it; may be empty
+    numbered: bool = False  # its messages are numbered 0, 1, 2, ...: our recorder wrote them
 
 
 class RawMessage(NamedTuple):
@@ -277,7 +280,8 @@ class McapFile:
         text = schema.data.decode('utf-8', 'replace')
         definition = Definition(schema.encoding, text, digest)
         name = full_type_name(schema.name)
-        return Channel(record.topic, name, record.message_encoding, definition, qos)
+        ours = self.library.startswith(LIBRARY)
+        return Channel(record.topic, name, record.message_encoding, definition, qos, ours)
 
     def _end(self, file: BinaryIO, at: int, opcode: int, content: bytes, size: int) -> bool:
         """Check a record of the summary; whether it is the file's last."""

@@ -31,7 +31,7 @@ from codetr_ros.bags.mcap_file import McapFile, OnDamage, RawMessage
 from codetr_ros.bags.mcap_layout import LARGEST_RECORD
 from codetr_ros.bags.metadata import METADATA
 from codetr_ros.bags.sqlite_file import SqliteFile
-from codetr_ros.received import RECORD_TYPES
+from codetr_ros.received import RECORD_TYPES, type_name
 from codetr_ros.records import Record, RecordError
 
 _KINDS: dict[str, type[McapFile | SqliteFile]] = {'.mcap': McapFile, '.db3': SqliteFile}
@@ -65,11 +65,12 @@ class Message(NamedTuple):
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a bag, and how many messages it has."""
+    """A topic of a bag, and how much there is of it."""
 
     name: str
     type: str
     count: int
+    bytes: int  # of all its messages, uncompressed
 
 
 class Bag:
@@ -100,20 +101,33 @@ class Bag:
         Raises:
             BagError: the bag is damaged, or says that one of our types is something else.
         """
+        names = None if kinds is None else {type_name(kind) for kind in kinds}
         for raw in self.raw():
-            kind = RECORD_TYPES.get(raw.channel.type)
-            if kind is None or (kinds is not None and kind not in kinds):
-                continue
-            try:
-                check_own(raw.channel.type, raw.channel.definition)
-            except BagError as error:
-                raise BagError(f'{raw.place}: {error}') from None
-            try:
-                record = decode(kind, raw.data)
-            except RecordError as error:
-                self._damaged(raw, str(error))
-                continue
-            yield Entry(kind, record, raw.channel.topic, raw.log_time, raw.publish_time, raw.place)
+            if names is None or raw.channel.type in names:
+                entry = self.entry(raw)
+                if entry is not None:
+                    yield entry
+
+    def entry(self, raw: RawMessage) -> Entry | None:
+        """Our record in a message; None if it is of another type, or damaged.
+
+        Raises:
+            BagError: it is damaged (unless `on_damage` is told), or the bag says that one of our
+                types is something else.
+        """
+        kind = RECORD_TYPES.get(raw.channel.type)
+        if kind is None:
+            return None
+        try:
+            check_own(raw.channel.type, raw.channel.definition)
+        except BagError as error:
+            raise BagError(f'{raw.place}: {error}') from None
+        try:
+            record = decode(kind, raw.data)
+        except RecordError as error:
+            self._damaged(raw, str(error))
+            return None
+        return Entry(kind, record, raw.channel.topic, raw.log_time, raw.publish_time, raw.place)
 
     def messages(
         self, topics: Collection[str] = (), types: Collection[str] = ()
@@ -153,22 +167,30 @@ class Bag:
         """
         types: dict[str, str] = {}
         counts: Counter[str] = Counter()
+        sizes: Counter[str] = Counter()
         for path in self.files:
             with ExitStack() as stack:
                 opened = open_file(path, stack, self.on_damage)
-                for message in opened.messages():
-                    if bytes(message.data[:4]) != _ZSTD_MAGIC:
+                for packed in opened.messages():
+                    message = self._unpacked(packed)
+                    if message is not None:
+                        sizes[message.channel.topic] += len(message.data)
                         yield message
-                        continue
-                    try:
-                        yield message._replace(data=_decompressed(message.data))
-                    except zstandard.ZstdError as error:
-                        self._damaged(message, f'its zstd data is damaged ({error})')
                 counts += opened.counts
                 types |= {channel.topic: channel.type for channel in opened.channels()}
         self._topics = {
-            name: Topic(name, kind, counts[name]) for name, kind in sorted(types.items())
+            name: Topic(name, kind, counts[name], sizes[name])
+            for name, kind in sorted(types.items())
         }
+
+    def _unpacked(self, message: RawMessage) -> RawMessage | None:
+        if bytes(message.data[:4]) != _ZSTD_MAGIC:
+            return message
+        try:
+            return message._replace(data=_decompressed(message.data))
+        except zstandard.ZstdError as error:
+            self._damaged(message, f'its zstd data is damaged ({error})')
+            return None
 
     @property
     def topics(self) -> dict[str, Topic]:

@@ -1,0 +1,173 @@
+"""What is in a bag, counted in one pass."""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from codetr_ros.bags.errors import Damage
+from codetr_ros.bags.reader import Bag, Entry
+from codetr_ros.records import (
+    Commit,
+    CompositeReward,
+    EpisodeResult,
+    Policy,
+    RunSpec,
+    StepRewards,
+    TaskSpec,
+    Transitions,
+)
+
+SETTINGS = ('task', 'composite', 'delay', 'method', 'steps', 'seed', 'simulators')
+"""The settings that are shown."""
+
+
+@dataclass
+class Range:
+    """Count, lowest, highest and mean of numbers."""
+
+    count: int = 0
+    low: float = float('inf')
+    high: float = float('-inf')
+    total: float = 0.0
+
+    def add(self, value: float) -> None:
+        """Take a number in."""
+        self.count += 1
+        self.low = min(self.low, value)
+        self.high = max(self.high, value)
+        self.total += value
+
+    def report(self) -> dict[str, float | int]:
+        """As JSON has it; only the count where there is nothing."""
+        if not self.count:
+            return {'count': 0}
+        mean = self.total / self.count
+        return {'count': self.count, 'min': self.low, 'max': self.high, 'mean': mean}
+
+
+@dataclass
+class Source:
+    """A simulator or robot in a run."""
+
+    task: str = ''
+    observation_size: int = 0
+    action_size: int = 0
+    horizon: int = 0
+    steps: int = 0
+    chunks: int = 0
+    episodes: int = 0  # begun
+    terminated: int = 0
+    truncated: int = 0
+
+
+@dataclass
+class Run:
+    """A run in a bag: everything with one run id in one namespace."""
+
+    namespace: str
+    run_id: str
+    settings: dict[str, Any] = field(default_factory=dict)
+    sources: dict[str, Source] = field(default_factory=dict)
+    phases: Range = field(default_factory=Range)
+    scores: Range = field(default_factory=Range)
+    scored_steps: int = 0
+    policy_versions: Range = field(default_factory=Range)
+    model_versions: Range = field(default_factory=Range)
+    labels: int = 0
+    evaluations: dict[int, Range] = field(default_factory=dict)  # true return, by step
+
+    def take(self, record: Any) -> None:
+        """Count a record."""
+        if isinstance(record, RunSpec):
+            self._settings(record)
+        elif isinstance(record, TaskSpec):
+            source = self.sources.setdefault(record.source, Source())
+            source.task, source.horizon = record.task, record.horizon
+            source.observation_size = record.observation_size
+            source.action_size = record.action_size
+        elif isinstance(record, Transitions):
+            self._steps(record)
+        elif isinstance(record, CompositeReward):
+            self.scores.add(record.value)
+            self.scored_steps += record.length
+        elif isinstance(record, Commit):
+            self.phases.add(record.phase)
+        elif isinstance(record, Policy):
+            self.policy_versions.add(record.version)
+        elif isinstance(record, StepRewards):
+            self.model_versions.add(record.version)
+            self.labels += len(record.labels)
+        elif isinstance(record, EpisodeResult) and record.purpose == 'evaluation':
+            self.evaluations.setdefault(record.step, Range()).add(record.true_return)
+
+    def _settings(self, record: RunSpec) -> None:
+        try:
+            said = json.loads(record.settings)
+        except ValueError:
+            return  # of `verify`
+        if isinstance(said, dict):
+            self.settings = {name: said[name] for name in SETTINGS if name in said}
+
+    def _steps(self, record: Transitions) -> None:
+        source = self.sources.setdefault(record.source, Source())
+        source.observation_size = record.observations.shape[1]
+        source.action_size = record.actions.shape[1]
+        source.steps += record.steps
+        source.chunks += 1
+        source.episodes += record.first_step == 0
+        source.terminated += record.terminated
+        source.truncated += record.truncated
+
+    def report(self) -> dict[str, Any]:
+        """As JSON has it."""
+        return {
+            'namespace': self.namespace,
+            'run_id': self.run_id,
+            'settings': self.settings,
+            'sources': {name: vars(source) for name, source in sorted(self.sources.items())},
+            'steps': sum(source.steps for source in self.sources.values()),
+            'episodes': sum(source.episodes for source in self.sources.values()),
+            'phases': self.phases.report(),
+            'segments_scored': self.scores.count,
+            'steps_scored': self.scored_steps,
+            'scores': self.scores.report(),
+            'policy_versions': self.policy_versions.report(),
+            'model_versions': self.model_versions.report(),
+            'labels': self.labels,
+            'evaluations': {n: r.report() for n, r in sorted(self.evaluations.items())},
+        }
+
+
+def namespace_of(entry: Entry) -> str:
+    """The namespace of an entry's topic."""
+    return entry.topic.rpartition('/')[0] or '/'
+
+
+def survey(path: Path | str) -> dict[str, Any]:
+    """What is in a bag, as JSON has it. Faults are counted, and do not end it.
+
+    Raises:
+        BagError: there is no bag there, or its messages are not those that we read.
+    """
+    faults: list[Damage] = []
+    bag = Bag(path, faults.append)
+    runs: dict[tuple[str, str], Run] = {}
+    times = Range()
+    for entry in bag.entries():
+        key = namespace_of(entry), entry.record.run_id
+        runs.setdefault(key, Run(*key)).take(entry.record)
+        times.add(entry.log_time)
+    return {
+        'bag': str(bag.path),
+        'files': [{'name': file.name, 'bytes': file.stat().st_size} for file in bag.files],
+        'bytes': sum(file.stat().st_size for file in bag.files),
+        'first_ns': times.low if times.count else None,
+        'last_ns': times.high if times.count else None,
+        'topics': {
+            name: {'type': topic.type, 'messages': topic.count, 'bytes': topic.bytes}
+            for name, topic in bag.topics.items()
+        },
+        'runs': [run.report() for _, run in sorted(runs.items())],
+        'faults': len(faults),
+    }

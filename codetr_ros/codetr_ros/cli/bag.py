@@ -1,0 +1,41 @@
+"""`codetr bag`: what is in a bag, is it sound, and make it whole again."""
+
+import sys
+from collections.abc import Callable, Sequence
+
+from codetr_ros.cli import USAGE, refuse
+
+HELP = """usage: codetr bag COMMAND BAG [OPTIONS]
+
+Bags: folders of MCAP or SQLite files, or one such file, by our recorder, `ros2 bag record` or
+others. No ROS is needed.
+
+commands:
+  info       what is in it: runs, episodes, segments, scores, topics, files
+
+`codetr bag COMMAND --help` explains the options of a command.
+"""
+
+
+def _info(arguments: Sequence[str]) -> int:
+    from codetr_ros.cli import bag_info
+
+    return bag_info.main(arguments)
+
+
+COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
+    'info': _info,
+}
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Carry out one of the commands; the exit code."""
+    if not arguments or arguments[0] in ('-h', '--help', 'help'):
+        print(HELP, end='', file=sys.stdout if arguments else sys.stderr)
+        return 0 if arguments else USAGE
+    command = COMMANDS.get(arguments[0])
+    if command is None:
+        return refuse(
+            f'there is no command bag {arguments[0]!r}: commands are {", ".join(COMMANDS)}'
+        )
+    return command(arguments[1:])

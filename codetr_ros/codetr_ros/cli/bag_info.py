@@ -1,0 +1,127 @@
+"""`codetr bag info`: what is in a bag, as tables."""
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from datetime import datetime, timezone
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from codetr_ros.cli import refuse
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Say what is in a bag. It is read from end to end; damage is counted and read past."""
+
+    bag: Annotated[
+        str, tyro.conf.Positional, tyro.conf.arg(metavar='BAG', help="the bag's folder or file")
+    ]
+    json: Annotated[bool, tyro.conf.arg(help='print JSON', name='json')] = False
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Read and print; the exit code."""
+    given = tyro.cli(
+        Arguments, prog='codetr bag info', args=arguments, config=(tyro.conf.FlagCreatePairsOff,)
+    )
+    from codetr_ros.bags.errors import BagError
+    from codetr_ros.bags.info import survey
+
+    try:
+        found = survey(given.bag)
+    except BagError as error:
+        return refuse(str(error))
+    if given.json:
+        print(json.dumps(found, indent=2))
+    else:
+        show(found, Console())
+    return 0
+
+
+def show(found: Mapping[str, Any], console: Console) -> None:
+    """Print what `survey` found."""
+    console.print(_bag(found))
+    for run in found['runs']:
+        console.print()
+        console.print(_run(run))
+    console.print()
+    console.print(_topics(found['topics']))
+    if found['faults']:
+        console.print(
+            f'\n{found["faults"]} faults were read past: `codetr bag verify {found["bag"]}` names '
+            'them',
+            style='yellow',
+            highlight=False,
+        )
+
+
+def _pairs() -> Table:
+    table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow='fold')
+    return table
+
+
+def _bag(found: Mapping[str, Any]) -> Table:
+    table = _pairs()
+    table.add_row('bag', found['bag'])
+    for file in found['files']:
+        table.add_row('file', f'{file["name"]}, {file["bytes"] / 1e6:.2f} MB')
+    first, last = found['first_ns'], found['last_ns']
+    if first is not None:
+        began = datetime.fromtimestamp(first / 1e9, timezone.utc)
+        table.add_row('recorded', f'{began:%Y-%m-%d %H:%M:%S} UTC, {(last - first) / 1e9:.1f} s')
+    return table
+
+
+def _run(run: Mapping[str, Any]) -> Table:
+    table = _pairs()
+    table.add_row('run', f'{run["run_id"]} in {run["namespace"]}')
+    for name, value in run['settings'].items():
+        table.add_row(name, str(value))
+    for name, source in run['sources'].items():
+        table.add_row(
+            f'source {name}',
+            f'{source["task"] or "no task announced"}: {source["observation_size"]} observations, '
+            f'{source["action_size"]} actions, {source["steps"]} steps in {source["chunks"]} '
+            f'chunks, {source["episodes"]} episodes ({source["terminated"]} terminated, '
+            f'{source["truncated"]} truncated)',
+        )
+    table.add_row('segments scored', f'{run["segments_scored"]}, {run["steps_scored"]} steps')
+    table.add_row('scores', _span(run['scores']))
+    table.add_row('phases committed', _whole_span(run['phases']))
+    table.add_row('policy versions', _whole_span(run['policy_versions']))
+    table.add_row('reward model versions', _whole_span(run['model_versions']))
+    table.add_row('labels', str(run['labels']))
+    if run['evaluations']:
+        step, last = list(run['evaluations'].items())[-1]
+        text = f'{len(run["evaluations"])}, true return at step {step}: {last["mean"]:.6g}'
+        table.add_row('evaluations', text)
+    return table
+
+
+def _span(values: Mapping[str, float]) -> str:
+    if not values['count']:
+        return 'none'
+    return f'{values["min"]:.6g} to {values["max"]:.6g}, mean {values["mean"]:.6g}'
+
+
+def _whole_span(values: Mapping[str, float]) -> str:
+    if not values['count']:
+        return 'none'
+    return f'{values["count"]}, from {values["min"]} to {values["max"]}'
+
+
+def _topics(topics: Mapping[str, Any]) -> Table:
+    table = Table(box=None, pad_edge=False)
+    table.add_column('topic')
+    table.add_column('type')
+    table.add_column('messages', justify='right')
+    table.add_column('MB', justify='right')
+    for name, topic in topics.items():
+        table.add_row(name, topic['type'], str(topic['messages']), f'{topic["bytes"] / 1e6:.2f}')
+    return table
