@@ -18,6 +18,7 @@ commands:
   fit        fit a reward model to bags, without any node
   evaluate   evaluate the policy of a run's newest checkpoint
   benchmark  many runs under one protocol, and the table that they make
+  bag        what is in a bag, is it sound, make it whole again
   tasks      list the tasks that have a name
   doctor     check Python, ROS, discovery, shared memory, torch and MuJoCo
 
@@ -49,6 +50,12 @@ def _benchmark(arguments: Sequence[str]) -> int:
     return benchmark.main(arguments)
 
 
+def _bag(arguments: Sequence[str]) -> int:
+    from codetr_ros.cli import bag
+
+    return bag.main(arguments)
+
+
 def _tasks(arguments: Sequence[str]) -> int:
     from codetr_ros.cli import list_tasks
 
@@ -66,6 +73,7 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     'fit': _fit,
     'evaluate': _evaluate,
     'benchmark': _benchmark,
+    'bag': _bag,
     'tasks': _tasks,
     'doctor': _doctor,
 }

@@ -82,7 +82,7 @@ def _run(run: Mapping[str, Any]) -> Table:
     table = _pairs()
     table.add_row('run', f'{run["run_id"]} in {run["namespace"]}')
     for name, value in run['settings'].items():
-        table.add_row(name, str(value))
+        table.add_row('steps planned' if name == 'steps' else name, str(value))
     for name, source in run['sources'].items():
         table.add_row(
             f'source {name}',
@@ -118,10 +118,11 @@ def _whole_span(values: Mapping[str, float]) -> str:
 
 def _topics(topics: Mapping[str, Any]) -> Table:
     table = Table(box=None, pad_edge=False)
-    table.add_column('topic')
+    table.add_column('topic', overflow='fold')
     table.add_column('type')
     table.add_column('messages', justify='right')
     table.add_column('MB', justify='right')
     for name, topic in topics.items():
-        table.add_row(name, topic['type'], str(topic['messages']), f'{topic["bytes"] / 1e6:.2f}')
+        kind = topic['type'].removeprefix('codetr_msgs/msg/')
+        table.add_row(name, kind, str(topic['messages']), f'{topic["bytes"] / 1e6:.2f}')
     return table

@@ -10,7 +10,7 @@ import tyro
 from rich.console import Console
 
 from codetr_ros import config, run_folder
-from codetr_ros.bags.writer import BagError
+from codetr_ros.bags.errors import BagError
 from codetr_ros.cli import refuse
 from codetr_ros.cli.flags import settings_fields
 from codetr_ros.config import Settings, SettingsError

@@ -1,0 +1,51 @@
+import json
+
+import pytest
+from bags.making import WRITERS, a_run, ours
+
+from codetr_ros.bags.info import survey
+from codetr_ros.cli import main
+from codetr_ros.records import CompositeReward
+
+
+@pytest.mark.parametrize('writer', ['ours', 'rosbags-sqlite-9', 'mcap-lz4'])
+def test_what_is_in_a_bag_is_counted(writer, tmp_path):
+    records = a_run(phases=3)
+    found = survey(WRITERS[writer](tmp_path / 'bag', records))
+    (run,) = found['runs']
+    assert run['run_id'] == 'run' and run['namespace'] == '/run'
+    assert run['settings']['delay'] == 5 and run['settings']['method'] == 'codetr'
+    assert (run['steps'], run['episodes'], run['segments_scored']) == (60, 4, 12)
+    assert run['phases'] == {'count': 3, 'min': 0, 'max': 2, 'mean': 1}
+    values = [record.value for record in records if isinstance(record, CompositeReward)]
+    assert run['scores']['min'] == min(values) and run['scores']['max'] == max(values)
+    assert run['sources']['sim'] | {'task': ''} == {
+        'task': '', 'observation_size': 3, 'action_size': 2, 'horizon': 1000,
+        'steps': 60, 'chunks': 12, 'episodes': 4, 'terminated': 0, 'truncated': 4,
+    }  # fmt: skip
+    assert found['topics']['/run/transitions']['messages'] == 12
+    assert found['faults'] == 0
+
+
+def test_info_shows_tables_and_json(tmp_path, capsys):
+    bag = ours(tmp_path / 'bag', a_run())
+    assert main(['bag', 'info', str(bag)]) == 0
+    said = capsys.readouterr().out
+    assert 'segments scored' in said and '/run/transitions' in said and '12' in said
+    assert main(['bag', 'info', str(bag), '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['runs'][0]['steps'] == 60
+
+
+def test_faults_are_counted_and_said(tmp_path, capsys):
+    bag = ours(tmp_path / 'bag', a_run())
+    path = bag / 'bag_0.mcap'
+    path.write_bytes(path.read_bytes()[:3000])
+    assert main(['bag', 'info', str(bag)]) == 0
+    assert 'codetr bag verify' in capsys.readouterr().out.replace('\n', ' ')
+
+
+def test_what_is_no_bag_is_refused(tmp_path, capsys):
+    assert main(['bag', 'info', str(tmp_path)]) == 2
+    assert 'holds no file of .mcap or .db3' in capsys.readouterr().err
+    assert main(['bag', 'turn']) == 2
+    assert "no command bag 'turn'" in capsys.readouterr().err
