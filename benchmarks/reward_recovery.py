@@ -26,12 +26,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy import stats
 
 from codetr_ros import in_process
 from codetr_ros.composite import composite
 from codetr_ros.config import Settings, load
 from codetr_ros.records import CompositeReward, Record, Transitions, TrueRewards
+from codetr_ros.recovery_metrics import r_squared, step_recovery
 from codetr_ros.rewards.codetr import Codetr
 from codetr_ros.rewards.method import segment_steps
 from codetr_ros.seeding import generator, seed_torch
@@ -153,18 +153,10 @@ def measure(
     assert batch.true_rewards is not None
     inside = segment_steps(batch)
     weights, _ = method.components(batch)
-    labels = method.label(batch).astype(np.float64)
-    true = np.where(inside, batch.true_rewards, 0).astype(np.float64)
-    residual = method.predict(batch) - batch.values
-    n = inside.sum(1, keepdims=True)
-    centred = [(x - x.sum(1, keepdims=True) / n)[inside] for x in (labels, true)]
+    labels = method.label(batch)
     return {
-        'composite_r2': 1
-        - (residual**2).sum() / ((batch.values - batch.values.mean()) ** 2).sum(),
-        'pearson': stats.pearsonr(labels[inside], true[inside]).statistic,
-        'spearman': stats.spearmanr(labels[inside], true[inside]).statistic,
-        'within_pearson': stats.pearsonr(*centred).statistic,
-        'within_spearman': stats.spearmanr(*centred).statistic,
+        'composite_r2': r_squared(method.predict(batch), batch.values),
+        **step_recovery(labels, batch.true_rewards, inside),
         'weights_sd': float(weights[inside].std()),
     }
 

@@ -222,6 +222,7 @@ def test_a_run_in_process_leaves_summary_metrics_report_and_picture(run_dir: Pat
     assert not said['interrupted']
     assert [row['step'] for row in said['evaluations']] == [100, 200, 250]
     assert said['random_score'] > 0
+    assert [row['step'] for row in said['reward_recovery']] == [100, 200, 250]
     assert len(said['policy_sha256']) == len(said['reward_model_sha256']) == 64
     assert (said['lost'], said['duplicated'], said['refused']) == (0, 0, 0)
     transitions = said['messages']['transitions']

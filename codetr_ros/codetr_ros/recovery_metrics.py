@@ -32,14 +32,22 @@ def step_recovery(
         `pearson` and `spearman` over all steps; `within_pearson` and `within_spearman` after each
         segment's mean was taken from both: is credit right inside the segment?
     """
-    pair = [np.where(inside, np.asarray(x, np.float64), 0.0) for x in (labels, true)]
-    n = np.maximum(inside.sum(1, keepdims=True), 1)
-    centred = [x - x.sum(1, keepdims=True) / n for x in pair]
+    segments = np.broadcast_to(np.arange(len(inside))[:, None], inside.shape)
+    return flat_recovery(np.asarray(labels)[inside], np.asarray(true)[inside], segments[inside])
+
+
+def flat_recovery(
+    labels: ArrayLike, true: ArrayLike, segments: NDArray[np.int64]
+) -> dict[str, float]:
+    """The same of steps (T,) in a row; `segments` (T,) numbers the segment of each."""
+    pair = [np.asarray(x, np.float64) for x in (labels, true)]
+    _, which = np.unique(segments, return_inverse=True)
+    n = np.bincount(which)
+    centred = [x - (np.bincount(which, x) / n)[which] for x in pair]
     # what rounding leaves of a constant from which its mean was taken is no variation
     least = [1e-9 * float(np.abs(x).max(initial=0)) for x in pair]
     found = {}
-    for prefix, sides in (('', pair), ('within_', centred)):
-        a, b = (side[inside] for side in sides)
+    for prefix, (a, b) in (('', pair), ('within_', centred)):
         varies = len(a) > 1 and np.ptp(a) > least[0] and np.ptp(b) > least[1]
         for name, measure in (('pearson', stats.pearsonr), ('spearman', stats.spearmanr)):
             found[prefix + name] = float(measure(a, b).statistic) if varies else float('nan')

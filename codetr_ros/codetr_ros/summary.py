@@ -22,6 +22,7 @@ import numpy as np
 from codetr_ros import run_folder
 from codetr_ros.config import Settings
 from codetr_ros.records import TOPICS, Commit, EpisodeResult, Metrics, Record
+from codetr_ros.recovery import Recovery
 
 Report = Mapping[str, Any]
 _COUNTS = ('published', 'recorded', 'received_by_learner', 'received_by_reward')
@@ -88,9 +89,13 @@ class Summary:
         self._training: dict[int, list[EpisodeResult]] = defaultdict(list)  # by phase
         self._metrics: dict[int, dict[tuple[str, str, str], float]] = defaultdict(dict)  # by phase
         self._phases = 0
+        # elsewhere true rewards and labels do not meet
+        self._recovery = Recovery(settings) if in_process else None
 
     def receive(self, record: Record) -> None:
         """Take note of a record of the run, of whatever kind."""
+        if self._recovery is not None:
+            self._recovery.receive(record)
         if isinstance(record, EpisodeResult):
             if record.purpose == 'training':
                 # the last phase that a step belongs to: step 1000 of 1000-step phases ends phase 0
@@ -171,6 +176,7 @@ class Summary:
             'steps_per_s': round(self.steps / wall, 3) if wall > 0 else None,
             'evaluations': evaluations,
             'random': random,
+            'reward_recovery': self._recovery.rows if self._recovery else [],
             'random_score': random['score_mean'] if random else None,
             'final_score': last['score_mean'] if last else None,
             'random_true_return': random['true_return_mean'] if random else None,
