@@ -29,6 +29,16 @@ class RunFolderError(ValueError):
     """A folder that cannot hold a run, or that does not hold one: names it and says what to do."""
 
 
+class FileError(OSError):
+    """A file that cannot be written: names it, the reason and the remedy."""
+
+    def __str__(self) -> str:
+        return (
+            f'{self.filename} cannot be written: {self.strerror}. Make room, or choose another '
+            'folder'
+        )
+
+
 def sync_folder(folder: Path) -> None:
     """Make renames and new names in a folder survive a power loss."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
@@ -39,11 +49,18 @@ def sync_folder(folder: Path) -> None:
 
 
 def write_synced(path: Path, data: bytes) -> None:
-    """Write a file and wait until it is on the disk."""
-    with path.open('wb') as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
+    """Write a file and wait until it is on the disk.
+
+    Raises:
+        FileError: the disk is full or the folder cannot be written.
+    """
+    try:
+        with path.open('wb') as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise FileError(error.errno, error.strerror, str(path)) from error
 
 
 def atomic_write(path: Path, data: bytes | str) -> None:
@@ -61,6 +78,9 @@ def atomic_write(path: Path, data: bytes | str) -> None:
     try:
         write_synced(partial, content)
         os.replace(partial, path)
+    except FileError as error:
+        partial.unlink(missing_ok=True)
+        raise FileError(error.errno, error.strerror, str(path)) from error
     except BaseException:
         partial.unlink(missing_ok=True)
         raise

@@ -80,7 +80,9 @@ def test_a_bag_is_closed_while_there_is_room_for_its_index(disk):
     write(writer, 30)
     writer.check_room()
     fill(disk, leave=900_000)
-    with pytest.raises(BagError, match='the disk has 1 MB left, fewer than the 1 MB to be kept'):
+    with pytest.raises(
+        BagError, match='the disk has 0.9 MB left, fewer than the 1.0 MB to be kept'
+    ):
         writer.check_room()
     writer.close()
     with (disk / 'bag' / 'bag_0.mcap').open('rb') as file:

@@ -178,8 +178,8 @@ class McapWriter:
         free = shutil.disk_usage(self.folder).free
         if free < self._keep_free:
             raise BagError(
-                f'bag {self.folder}: the disk has {free / 1e6:.0f} MB left, fewer than the '
-                f'{self._keep_free / 1e6:.0f} MB to be kept free: make room, and start the run '
+                f'bag {self.folder}: the disk has {free / 1e6:.1f} MB left, fewer than the '
+                f'{self._keep_free / 1e6:.1f} MB to be kept free: make room, and start the run '
                 f'again in another folder'
             )
 

@@ -106,9 +106,12 @@ def train(settings: Settings, run_id: str, folder: Path, in_process: bool) -> in
         in_process: without nodes.
 
     Returns:
-        The exit code: 0 finished, 1 failed, 130 interrupted.
+        The exit code: 0 finished, 1 failed, 2 refused, 130 interrupted.
     """
-    run_folder.write_settings(folder, settings)
+    try:
+        run_folder.write_settings(folder, settings)
+    except OSError as error:
+        return refuse(str(error))
     summary = Summary(settings, run_id, in_process)
     progress = Progress(settings)
     progress.say(
@@ -125,8 +128,11 @@ def train(settings: Settings, run_id: str, folder: Path, in_process: bool) -> in
         built = summary.build(
             outcome.reports, bag if bag.is_dir() else None, outcome.interrupted, outcome.failure
         )
-        write_summary(folder, built, summary.metrics_csv())
-        report.write(folder, built)
+        try:
+            write_summary(folder, built, summary.metrics_csv())
+            report.write(folder, built)
+        except OSError as error:
+            outcome.failure = '; '.join(filter(None, (outcome.failure, str(error))))
     show(built, folder, Console())
     if outcome.failure:
         say_failure(outcome)

@@ -1,0 +1,98 @@
+"""The recorder node: what is committed is on the disk, and a full disk ends the run."""
+
+import os
+
+import numpy as np
+import pytest
+from builders import commit, policy, score, task_spec, transitions
+from disks import fill, small_disk
+from mcap.reader import make_reader
+from rclpy.serialization import serialize_message
+from ros.playing import everybody_matched, output, process
+from ros.test_bag_splits import files
+from ros.test_bag_writer import sequences
+
+from codetr_ros import run_folder
+from codetr_ros.ros.recording import RecordNode
+from codetr_ros.ros.signals import Stop
+
+
+@pytest.fixture
+def recorder(play, tmp_path):
+    """A recorder node with its bag open, not joined to anything."""
+    play = play(roles=())
+    node = RecordNode('record', 'record', lambda: None, Stop())
+    node.values = {'bag': str(tmp_path / 'bag'), 'bag_split_mb': 0.0, 'bag_keep_free_mb': 0.0}
+    node.run_spec, node.settings = play.spec, play.settings
+    node.link.advertise(['run', 'commits'])
+    node._run_message = serialize_message(node.link.message(play.spec))
+    node.open_topics(play.settings)
+    yield node
+    node.link.close()
+
+
+def test_a_commit_goes_out_when_it_and_all_before_it_are_on_the_disk(
+    recorder, tmp_path, monkeypatch
+):
+    path = tmp_path / 'bag' / 'bag_0.mcap'
+    happened = []
+    fsync, send = os.fsync, recorder.link.send
+
+    def watched_fsync(descriptor):
+        fsync(descriptor)
+        happened.append(('on the disk', os.fstat(descriptor).st_size))
+
+    def watched_send(topic, message):
+        happened.append((topic, path.stat().st_size))
+        send(topic, message)
+
+    monkeypatch.setattr(os, 'fsync', watched_fsync)
+    monkeypatch.setattr(recorder.link, 'send', watched_send)
+    recorder.deliver(commit())
+    size = path.stat().st_size
+    assert happened == [('on the disk', size), ('commits', size)]
+    recorder.closing()
+    with path.open('rb') as file:
+        topics = [channel.topic for _, channel, _ in make_reader(file).iter_messages()]
+    assert topics == ['/r/run', '/r/commits']
+
+
+def one_phase_on(disk, play, keep_free, leave):
+    """What a recorder says that has a phase to record on a disk which is full by then."""
+    parameters = f'bag:={disk / "run" / "bag"}', f'bag_keep_free_mb:={keep_free}'
+    with process('record', *parameters, f'folder:={disk / "run"}') as node:
+        play.until(lambda: everybody_matched(play), node)
+        fill(disk, leave)
+        sim, learner = play.links['sim'], play.links['learner']
+        sim.publish(task_spec())
+        learner.publish(policy(steps=np.array([5], np.uint32)))
+        sim.publish(transitions(steps=5, phase_end=True, scores_due=1))
+        sim.publish(score(length=5))
+        play.until(lambda: node.poll() is not None)
+        said = output(node)
+    assert node.returncode == 1
+    assert not play.messages('Commit')
+    assert 'Traceback' not in said
+    return said
+
+
+def test_a_disk_that_runs_full_ends_the_run_while_the_bag_can_be_closed(play, tmp_path):
+    with small_disk(tmp_path / 'disk', 8) as disk:
+        said = one_phase_on(disk, play(), keep_free=1.0, leave=500_000)
+        assert '/run/bag: the disk has 0.5 MB left, fewer than the 1.0 MB to be kept free' in said
+        (path,) = files(disk / 'run' / 'bag')
+        with path.open('rb') as file:
+            recorded = [c.topic for _, c, _ in make_reader(file).iter_messages()]
+        assert {'/r/transitions', '/r/composite_rewards'} <= set(recorded)
+        assert '/r/commits' not in recorded
+        assert (disk / 'run' / 'bag' / 'metadata.yaml').is_file()
+        report = run_folder.read_report(run_folder.report_path(disk / 'run', 'record', 'record'))
+        assert 'fewer than the 1.0 MB' in report['error']
+
+
+def test_a_disk_that_is_full_ends_the_run_with_an_error_that_says_so(play, tmp_path):
+    with small_disk(tmp_path / 'disk', 8) as disk:
+        said = one_phase_on(disk, play(), keep_free=0.0, leave=0)
+        assert 'bag_0.mcap cannot be written: No space left on device' in said
+        (path,) = files(disk / 'run' / 'bag')
+        assert sequences(path) == []  # nothing was committed, and what there is can be read
