@@ -292,6 +292,31 @@ class TestCodetrOfRewardsAlone(TestCodetr):
     changes: ClassVar[dict[str, Any]] = {'codetr__label': 'rhat', 'codetr__head_scale': 'one'}
 
 
+class TestRbt(LearnedContract):
+    method = 'rbt'
+
+    def test_a_gradient_step_says_both_losses(self):
+        memory = filled()
+        said = self.trained(memory).gradient_step(memory, generator(0))
+        assert said.keys() == {'reward_loss', 'state_loss', 'learning_rate'}
+
+
+class TestRbtWithAWindow(TestRbt):
+    changes: ClassVar[dict[str, Any]] = {
+        'rbt__attention_scope': 'window',
+        'codetr__window': 10,
+        'codetr__tokens': 'pair',
+    }
+
+
+class TestRrd(LearnedContract):
+    method = 'rrd'
+
+
+class TestRrdUnbiased(TestRrd):
+    changes: ClassVar[dict[str, Any]] = {'rrd__loss': 'unbiased'}
+
+
 class TestMlp(LearnedContract):
     method = 'mlp'
 

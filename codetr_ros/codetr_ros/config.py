@@ -21,7 +21,7 @@ from codetr_ros.records import PROTOCOL_VERSION, RunSpec
 Composite = Literal[
     'sum', 'sum_square', 'square_sum', 'max', 'max_hard', 'max_log_sum_exp', 'max_times_n'
 ]
-Method = Literal['codetr', 'none', 'ircr', 'mlp', 'uniform', 'true', 'ones']
+Method = Literal['codetr', 'none', 'rbt', 'rrd', 'ircr', 'mlp', 'uniform', 'true', 'ones']
 Hidden = tuple[Annotated[int, Field(ge=1, le=65536)], ...]
 IN_PROCESS_ONLY: tuple[str, ...] = ('true', 'ones')
 """Reference methods: they look at what no node may see (`true`) or ignore the scores (`ones`)."""
@@ -133,6 +133,22 @@ class CodetrSettings(Group):
         return self
 
 
+class RbtSettings(Group):
+    """What RBT has beyond the transformer, whose settings it shares with CoDeTr (`codetr`).
+
+    Of those, `weights`, `label`, `context` and `attention_scope` are CoDeTr's alone.
+    """
+
+    state_loss_weight: float = Field(
+        1.0, ge=0, le=1000, description='weight of the loss on the predicted next observation'
+    )
+    attention_scope: Literal['segment', 'window'] = Field(
+        'segment',
+        description='attention sees the segment only, or up to `codetr.window` steps before it '
+        'as well',
+    )
+
+
 class PerceptronSettings(Group):
     """A reward model that sees one step at a time."""
 
@@ -158,6 +174,30 @@ class MlpSettings(PerceptronSettings):
     """The Markovian control: trained on segments as the transformer is."""
 
     batch: int = Field(64, ge=1, le=65536, description='segments in a gradient step')
+
+
+class RrdSettings(PerceptronSettings):
+    """Randomized return decomposition (section 4 of the method)."""
+
+    loss: Literal['biased', 'unbiased'] = Field(
+        'biased',
+        description='the published default, or less the variance that the drawing of steps adds',
+    )
+    subsequences: int = Field(
+        4, ge=1, le=65536, description='segments in a gradient step, drawn by their lengths'
+    )
+    subsequence_steps: int = Field(
+        64, ge=2, le=65536, description='steps K drawn from each segment'
+    )
+    first_gradient_steps: int = Field(
+        1000, ge=0, le=10**6, description='gradient steps after the last warm-up phase'
+    )
+    gradient_steps: int = Field(
+        1000,
+        ge=0,
+        le=10**6,
+        description='gradient steps after every later phase; published: one for each SAC update',
+    )
 
 
 class SacSettings(Group):
@@ -260,6 +300,12 @@ class Settings(Group):
     threads: int = Field(1, ge=1, le=256, description='torch threads of each process')
     codetr: CodetrSettings = Field(
         default_factory=CodetrSettings, description='the reward transformer'
+    )
+    rbt: RbtSettings = Field(
+        default_factory=RbtSettings, description='RBT, beyond the reward transformer'
+    )
+    rrd: RrdSettings = Field(
+        default_factory=RrdSettings, description='randomized return decomposition'
     )
     mlp: MlpSettings = Field(
         default_factory=MlpSettings, description='the reward model of single steps'

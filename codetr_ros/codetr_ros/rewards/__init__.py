@@ -5,7 +5,9 @@ from codetr_ros.rewards.codetr import Codetr
 from codetr_ros.rewards.ircr import Ircr
 from codetr_ros.rewards.method import RewardMethod, RewardModelError, Schedule, segment_steps
 from codetr_ros.rewards.mlp import Mlp
+from codetr_ros.rewards.rbt import Rbt
 from codetr_ros.rewards.redistribution import LastStep, Ones, TrueReward, Uniform
+from codetr_ros.rewards.rrd import Rrd
 
 __all__ = [
     'METHODS',
@@ -18,7 +20,8 @@ __all__ = [
 ]
 
 METHODS: dict[str, type[RewardMethod]] = {
-    method.name: method for method in (Codetr, LastStep, Ircr, Mlp, Uniform, TrueReward, Ones)
+    method.name: method
+    for method in (Codetr, LastStep, Rbt, Rrd, Ircr, Mlp, Uniform, TrueReward, Ones)
 }
 """Reward methods by the name that `settings.method` gives them."""
 

@@ -147,7 +147,7 @@ class RewardTransformer(nn.Module):
         attentive = settings.weights == 'attention'
         self.weights = SequenceWeights(settings) if attentive else UnitWeights()
         self.reward = nn.Linear(settings.embedding, 1)
-        _initialise(self, settings)
+        initialise(self, settings)
 
     def forward(
         self, observations: Tensor, actions: Tensor, inside: Tensor
@@ -166,7 +166,7 @@ class RewardTransformer(nn.Module):
         return self.weights(x, inside), self.reward(x).squeeze(-1)
 
 
-def _initialise(network: RewardTransformer, settings: CodetrSettings) -> None:
+def initialise(network: nn.Module, settings: CodetrSettings) -> None:
     """Zero biases and normal weights.
 
     'gpt2' (standard deviation 0.02, and 0.02 / sqrt(2 layers) where a block adds to its input)
