@@ -30,9 +30,12 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
 
 def main(arguments: Sequence[str]) -> int:
     """Carry out one of the commands; the exit code."""
-    if not arguments or arguments[0] in ('-h', '--help', 'help'):
-        print(HELP, end='', file=sys.stdout if arguments else sys.stderr)
-        return 0 if arguments else USAGE
+    if not arguments:
+        print(HELP, end='', file=sys.stderr)
+        return USAGE
+    if arguments[0] in ('-h', '--help', 'help'):
+        print(HELP, end='')
+        raise SystemExit(0)  # as after --help of the other commands
     command = COMMANDS.get(arguments[0])
     if command is None:
         return refuse(
