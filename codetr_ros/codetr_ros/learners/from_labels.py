@@ -1,14 +1,15 @@
 """SAC on the inferred step rewards: the policy learner of every method that labels steps."""
 
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 from torch import Tensor
 
 from codetr_ros.config import Settings
 from codetr_ros.learners import network
+from codetr_ros.learners.flat_sac import FlatSAC
 from codetr_ros.learners.learner import OffPolicy
-from codetr_ros.learners.sac import SAC
 from codetr_ros.trajectories import Trajectories
 
 
@@ -25,7 +26,7 @@ class FromLabels(OffPolicy):
 
     def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
         super().__init__(settings)
-        self._sac = SAC(observation_size, action_size, settings.sac, settings.seed)
+        self._sac = FlatSAC(observation_size, action_size, settings.sac, settings.seed)
         self.network = network.describe(observation_size, action_size, settings.sac.hidden)
 
     @property
@@ -37,7 +38,12 @@ class FromLabels(OffPolicy):
         return memory.labelled_steps > 0
 
     def _update(self, memory: Trajectories, rng: np.random.Generator) -> dict[str, Tensor]:
-        return self._sac.update(memory.sample_steps(rng, self._settings.sac.batch))
+        return self._burst(memory, rng, 1)
+
+    def _burst(
+        self, memory: Trajectories, rng: np.random.Generator, updates: int
+    ) -> dict[str, Tensor]:
+        return self._sac.burst(updates, partial(memory.sample_steps, rng))
 
     def state(self) -> dict[str, Tensor]:
         """Everything that it takes to go on from here, in copies."""

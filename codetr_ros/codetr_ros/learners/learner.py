@@ -94,6 +94,15 @@ class OffPolicy(ABC):
             Scalar tensors: their means over the phase are its metrics.
         """
 
+    def _burst(
+        self, memory: Trajectories, rng: np.random.Generator, updates: int
+    ) -> dict[str, Tensor]:
+        """Updates in a row: the sums of what each of them says."""
+        totals: dict[str, Tensor] = {}
+        for _ in range(updates):
+            _add(totals, self._update(memory, rng))
+        return totals
+
     def train(self, phase: int, memory: Trajectories) -> Iterator[dict[str, float]]:
         """As many updates as the phase asks for, or none where there is nothing to draw.
 
@@ -113,9 +122,7 @@ class OffPolicy(ABC):
             rng = generator(settings.seed, 'learner', phase, done)
             seed_torch(settings.seed, 'learner', phase, done)
             burst = min(settings.sac.burst, due - done)
-            for _ in range(burst):
-                for name, value in self._update(memory, rng).items():
-                    totals[name] = totals.get(name, torch.zeros(())) + value
+            _add(totals, self._burst(memory, rng, burst))
             done += burst
             self.updates += burst
             yield {}
@@ -127,6 +134,11 @@ class OffPolicy(ABC):
                 'target_scale=rms and reward_unit=scaled'
             )
         yield means | {'update_seconds': time.perf_counter() - began}
+
+
+def _add(totals: dict[str, Tensor], values: Mapping[str, Tensor]) -> None:
+    for name, value in values.items():
+        totals[name] = totals.get(name, torch.zeros(())) + value
 
 
 def check_state(learner: str, expected: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> None:

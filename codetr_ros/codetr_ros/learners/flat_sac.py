@@ -1,0 +1,259 @@
+"""The update of `sac.SAC` made fast on a CPU: gradients by hand, weights in a few flat tensors.
+
+All parameters of one optimiser lie in one tensor, Adam's moments likewise, so that a step of Adam
+or of the targets is one call; what others know as weights and moments are views of these. One pass
+of the actor serves both s' and s. In the actor's step gradients go through the critics to the
+actions and no further. Nothing is left to autograd: what it would do is written out below, and
+equals it up to rounding.
+
+Shapes: B = batch, O = observation size, A = action size, H = width of a hidden layer. A network is
+a stack of N networks, N = 1 (actor) or 2 (critics, targets): its layers are weights (N, in, out)
+and biases (N, 1, out), one after the other; its activations are (N, B, H).
+"""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.optim.adam import adam
+
+from codetr_ros.config import SacSettings
+from codetr_ros.learners.network import LOG_STD_RANGE
+from codetr_ros.learners.sac import SAC, Adam, squashed_gaussian
+from codetr_ros.trajectories import StepBatch
+
+METRICS = ('critic_loss', 'actor_loss', 'temperature', 'entropy', 'q_mean')
+"""What `SAC.update` says, in the order in which it is summed here."""
+DRAWN_AT_ONCE = 64
+"""Updates whose steps and noise are drawn in one go; more would take memory and save no time."""
+
+
+class FlatSAC(SAC):
+    """SAC with the fast update. The states of this form and of the plain one are the same."""
+
+    def __init__(
+        self, observation_size: int, action_size: int, settings: SacSettings, seed: int
+    ) -> None:
+        """Make the networks: for the same arguments those of the plain form.
+
+        Args:
+            observation_size: O.
+            action_size: A.
+            settings: widths, learning rates and the rest.
+            seed: of the initial weights; torch's global generator is seeded from it.
+        """
+        super().__init__(observation_size, action_size, settings, seed)
+        self.batch = settings.batch
+        self.critic_adam = self._critic = FlatAdam(self.critic, settings.critic_learning_rate)
+        self.actor_adam = self._actor = FlatAdam(
+            list(self.actor.parameters()), settings.actor_learning_rate
+        )
+        self.temperature_adam = self._temperature = FlatAdam(
+            [self.log_temperature], settings.temperature_learning_rate
+        )
+        self.critic_values = self._critic.views(self._critic.flat)
+        self._flat_target = self._critic.flat.clone()
+        self.target = self._critic.views(self._flat_target)
+        self._sums = torch.zeros(len(METRICS))
+
+    def update(self, batch: StepBatch) -> dict[str, Tensor]:
+        """One update of everything, as `SAC.update`."""
+        self._learn(batch, 1)
+        return self._said()
+
+    def burst(self, updates: int, draw: Callable[[int], StepBatch]) -> dict[str, Tensor]:
+        """Many updates.
+
+        Args:
+            updates: how many.
+            draw: gives the steps to learn from, as many as it is asked for.
+
+        Returns:
+            What `SAC.update` says, summed over the updates.
+        """
+        for first in range(0, updates, DRAWN_AT_ONCE):
+            count = min(DRAWN_AT_ONCE, updates - first)
+            self._learn(draw(count * self.batch), count)
+        return self._said()
+
+    def _said(self) -> dict[str, Tensor]:
+        said = dict(zip(METRICS, self._sums.clone(), strict=True))
+        self._sums.zero_()
+        return said
+
+    @torch.no_grad()
+    def _learn(self, batch: StepBatch, updates: int) -> None:
+        """Updates, each from its share of the batch, in order."""
+        # Copies, in memory of torch's own: how an array lies can change the last bit of a product.
+        s, a, r = map(torch.tensor, (batch.observations, batch.actions, batch.rewards))
+        s2, terminated = map(torch.tensor, (batch.next_observations, batch.terminated))
+        going_on = self.discount * (1 - terminated.to(r.dtype))
+        # the numbers that updates one by one would draw, where B A is a multiple of 8
+        noise = torch.randn(updates, 2, len(a) // updates, a.shape[1], dtype=a.dtype)
+        shares = (part.view(updates, -1, *part.shape[1:]) for part in (s, a, r, s2, going_on))
+        for share in zip(*shares, noise, strict=True):
+            self._update(*share)
+
+    def _update(
+        self, s: Tensor, a: Tensor, r: Tensor, s2: Tensor, going_on: Tensor, noise: Tensor
+    ) -> None:
+        """One update; what it says is added to the sums.
+
+        Args:
+            s: observations (B, O).
+            a: actions (B, A).
+            r: rewards (B,).
+            s2: next observations (B, O).
+            going_on: gamma (1 - terminated), (B,).
+            noise: standard normal, (2, B, A): of the actions after s', and after s.
+        """
+        B, A = a.shape
+        actor = _stack_of_one(self._actor.views(self._actor.flat))
+        critic = self._critic.views(self._critic.flat)
+        target = self._critic.views(self._flat_target)
+        alpha = self._temperature.flat.exp().squeeze()
+
+        # The policy's actions after s' and s, in one pass.
+        actor_hidden = forward(actor, torch.cat([s2, s])[None])
+        out = torch.baddbmm(actor[-1], actor_hidden[-1], actor[-2])[0]  # (2B, 2A)
+        mean, log_std = out[:, :A], out[:, A:].clamp(*LOG_STD_RANGE)
+        actions, log_probs = squashed_gaussian((mean, log_std), noise.view(2 * B, A))
+        (a2, a_pi), (log_prob2, log_prob) = actions.chunk(2), log_probs.chunk(2)
+
+        # Target: y = r + gamma (1 - terminated) (min_i Q'_i(s', a') - alpha log pi(a'|s')).
+        q2 = values(target, forward(target, pairs(s2, a2)))
+        y = r + going_on * (torch.minimum(*q2) - alpha * log_prob2)  # (B,)
+
+        # Critics: the mean over the batch of (Q_1(s, a) - y)^2 + (Q_2(s, a) - y)^2.
+        hidden = forward(critic, pairs(s, a))
+        q = values(critic, hidden)  # (2, B)
+        error = q - y
+        dq = (2 / B) * error.unsqueeze(-1)  # (2, B, 1)
+        gradients = [
+            g
+            for x, d in zip(hidden, slopes(critic, hidden, dq * critic[-2].mT), strict=False)
+            for g in (x.mT @ d, d.sum(1))
+        ]
+        # the last one is (2, 1, H), the same numbers as (2, H, 1) and twelve times as fast
+        self._critic.descend([*gradients, dq.mT @ hidden[-1], dq.sum(1)])
+
+        # Targets follow: Q' <- (1 - tau) Q' + tau Q.
+        self._flat_target.lerp_(self._critic.flat, self.tau)
+
+        # Actor: the mean of alpha log pi(a|s) - min_i Q_i(s, a), a ~ pi(s), under the new critics.
+        hidden = forward(critic, pairs(s, a_pi))
+        q1_pi, q2_pi = values(critic, hidden)
+        # the smaller value alone has a gradient; equal ones have half of it each
+        first = 0.5 + 0.5 * (q2_pi - q1_pi).sign()
+        dq = (-1 / B) * torch.stack([first, 1 - first]).unsqueeze(-1)
+        d = slopes(critic, hidden, dq * critic[-2].mT)[0]
+        da = torch.bmm(d, critic[0][:, -A:].mT).sum(0)  # (B, A)
+        # d a / d u = 1 - a^2, and d log pi / d u = 2 tanh(u) = 2 a; u = mean + exp(log_std) noise
+        du = da * (1 - a_pi.square()) + (2 / B) * alpha * a_pi
+        d_log_std = du * log_std[B:].exp() * noise[1] - alpha / B
+        inside = (out[B:, A:] >= LOG_STD_RANGE[0]) & (out[B:, A:] <= LOG_STD_RANGE[1])
+        d_out = torch.cat([du, d_log_std * inside], -1)[None]  # (1, B, 2A)
+        xs = [x[:, B:] for x in actor_hidden]
+        gradients = [
+            g
+            for x, d in zip(
+                xs,
+                [*slopes(actor, xs, d_out @ actor[-2].mT), d_out],
+                strict=True,
+            )
+            for g in (d.mT @ x, d.sum(1))
+        ]
+        self._actor.descend(gradients)
+
+        # Temperature: alpha (entropy - target entropy), the entropy as the actor's step saw it.
+        entropy = -log_prob.mean()
+        self._temperature.descend([alpha * (entropy - self.target_entropy)])
+
+        actor_loss = (alpha * log_prob - torch.minimum(q1_pi, q2_pi)).mean()
+        critic_loss = error.square().sum(0).mean()
+        self._sums += torch.stack([critic_loss, actor_loss, alpha, entropy, q.mean()])
+
+
+class FlatAdam(Adam):
+    """Adam for parameters that lie in one tensor, and one step for gradients that are given.
+
+    The parameters become views of `flat`, and the moments that `state` tells of those of `mean`
+    and `square`.
+    """
+
+    def __init__(self, parameters: Sequence[nn.Parameter], learning_rate: float) -> None:
+        super().__init__(parameters, learning_rate)
+        self.flat = torch.cat([p.detach().reshape(-1) for p in parameters])
+        self.mean, self.square = torch.zeros_like(self.flat), torch.zeros_like(self.flat)
+        self.count = torch.zeros((), dtype=torch.float32)
+        self._shapes = [p.shape for p in parameters]
+        for parameter, view in zip(parameters, self.views(self.flat), strict=True):
+            parameter.data = view
+        self.means, self.squares = self.views(self.mean), self.views(self.square)
+        self.steps = [self.count] * len(self.parameters)
+
+    def views(self, flat: Tensor) -> list[Tensor]:
+        """The parts of a tensor like `flat`, each in its parameter's shape."""
+        parts = torch.split(flat, [shape.numel() for shape in self._shapes])
+        return [part.view(shape) for part, shape in zip(parts, self._shapes, strict=True)]
+
+    def descend(self, gradients: Sequence[Tensor]) -> None:
+        """One step down these gradients: as many numbers as parameters, in their order."""
+        adam(
+            [self.flat],
+            [torch.cat([g.reshape(-1) for g in gradients])],
+            [self.mean],
+            [self.square],
+            [],
+            [self.count],
+            fused=True,
+            amsgrad=False,
+            beta1=0.9,
+            beta2=0.999,
+            lr=self.learning_rate,
+            weight_decay=0.0,
+            eps=1e-8,
+            maximize=False,
+        )
+
+
+def _stack_of_one(parameters: Sequence[Tensor]) -> list[Tensor]:
+    """The layers of an actor, weights (out, in) and biases (out,), as those of a stack."""
+    return [p.T[None] if p.ndim == 2 else p[None, None] for p in parameters]
+
+
+def pairs(observations: Tensor, actions: Tensor) -> Tensor:
+    """What both critics look at: (2, B, O+A)."""
+    return torch.cat([observations, actions], -1).expand(2, -1, -1)
+
+
+def forward(network: Sequence[Tensor], x: Tensor) -> list[Tensor]:
+    """The input (N, B, in) and the activations of each hidden layer."""
+    activations = [x]
+    for weight, bias in zip(network[:-2:2], network[1:-2:2], strict=True):
+        activations.append(torch.baddbmm(bias, activations[-1], weight).relu_())
+    return activations
+
+
+def values(critic: Sequence[Tensor], activations: Sequence[Tensor]) -> Tensor:
+    """What critics whose activations are given think of each pair: (2, B)."""
+    # faster than a product with one column
+    return (activations[-1] * critic[-2].mT).sum(-1) + critic[-1].squeeze(-1)
+
+
+def slopes(
+    network: Sequence[Tensor], activations: Sequence[Tensor], gradient: Tensor
+) -> list[Tensor]:
+    """Gradients with respect to what enters the ReLU of each hidden layer, the first one first.
+
+    Args:
+        network: its layers.
+        activations: what `forward` made of it.
+        gradient: with respect to the last activations.
+    """
+    found: list[Tensor] = []
+    for i in reversed(range(1, len(activations))):
+        found.insert(0, torch.ops.aten.threshold_backward(gradient, activations[i], 0))
+        if i > 1:
+            gradient = found[0] @ network[2 * i - 2].mT
+    return found
