@@ -6,20 +6,22 @@ HalfCheetah.
 The data is the replay of a true-reward run of 20 000 steps (small networks), so that it ranges
 from random to running. Four fifths of its episodes train each model on nothing but composite
 rewards of 25 steps; the last fifth, every fifth episode, is held out. For each composite reward
-and each variant of the model it gives
+and each variant (CoDeTr, changed in one setting, or another method) it gives
 
-    composite_r2       R^2 of the predicted composite reward
+    composite_r2       R^2 of the predicted composite reward; nan for methods that predict none
     pearson, spearman  correlation of inferred and true step rewards
     within_pearson     the same with each segment's mean removed from both: is credit right inside
-    the segment? within_spearman weights_sd         standard deviation of the attention weights w
-    (1 on average)
+    within_spearman    the segment? nan for methods that give all of its steps the same
+    weights_sd         standard deviation of CoDeTr's attention weights w (1 on average)
 
 over held-out steps. A high R^2 says little about the steps, which is why the others are here.
+`ircr` and `uniform` take no gradient steps, whatever the column says.
 Rows that are in the file already are not run again. Means over seeds go beside it as Markdown.
 """
 
 import argparse
 import csv
+import math
 import subprocess
 import time
 from pathlib import Path
@@ -27,12 +29,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from codetr_ros import in_process
+from codetr_ros import in_process, rewards
 from codetr_ros.composite import composite
 from codetr_ros.config import Settings, load
 from codetr_ros.records import CompositeReward, Record, Transitions, TrueRewards
 from codetr_ros.recovery_metrics import r_squared, step_recovery
 from codetr_ros.rewards.codetr import Codetr
+from codetr_ros.rewards.learned import Learned
 from codetr_ros.rewards.method import segment_steps
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.trajectories import Trajectories
@@ -52,6 +55,12 @@ VARIANTS: dict[str, dict[str, object]] = {
     'raw observations': {'codetr.normalise_observations': False},
     'raw targets': {'target_scale': 'none'},
     'context episode': {'codetr.context': 'episode', 'codetr.window': 50},
+    'method rbt': {'method': 'rbt'},
+    'method rrd biased': {'method': 'rrd'},
+    'method rrd unbiased': {'method': 'rrd', 'rrd.loss': 'unbiased'},
+    'method mlp': {'method': 'mlp'},
+    'method ircr': {'method': 'ircr'},
+    'method uniform': {'method': 'uniform'},
 }
 COLUMNS = (
     'composite',
@@ -144,7 +153,7 @@ def measure(
 ) -> dict[str, float]:
     """Fit on the training episodes, compare on the held-out ones."""
     train, held_out = memories(data, settings)
-    method = Codetr(settings, train.observation_size, train.action_size)
+    method = rewards.make(settings, train.observation_size, train.action_size)
     method.prepare(train)
     for i in range(gradient_steps):
         seed_torch(settings.seed, 'recovery', i)
@@ -152,12 +161,11 @@ def measure(
     batch = held_out.segment_batch(held_out.segment_ids(), method.context)
     assert batch.true_rewards is not None
     inside = segment_steps(batch)
-    weights, _ = method.components(batch)
-    labels = method.label(batch)
+    predicts, attends = isinstance(method, Learned), isinstance(method, Codetr)
     return {
-        'composite_r2': r_squared(method.predict(batch), batch.values),
-        **step_recovery(labels, batch.true_rewards, inside),
-        'weights_sd': float(weights[inside].std()),
+        'composite_r2': r_squared(method.predict(batch), batch.values) if predicts else math.nan,
+        **step_recovery(method.label(batch), batch.true_rewards, inside),
+        'weights_sd': float(method.components(batch)[0][inside].std()) if attends else math.nan,
     }
 
 
