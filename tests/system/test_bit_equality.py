@@ -2,6 +2,7 @@
 altered.
 """
 
+import itertools
 from typing import Any
 
 import pytest
@@ -15,12 +16,14 @@ from codetr_ros.summary import Summary
 # Episodes of the pendulum end early and at any step; those of the reacher at 50. Segments of 7
 # steps fit into neither a phase of 200 steps nor an episode of 50.
 PENDULUM, REACHER = 'InvertedDoublePendulum-v5', 'Reacher-v5'
-# Every pair of task and method, task and pace, method and pace.
-PAIRS = [
-    (PENDULUM, 'codetr', 'lock-step'),
-    (PENDULUM, 'none', 'overlap'),
-    (REACHER, 'codetr', 'overlap'),
-    (REACHER, 'none', 'lock-step'),
+CASES = [
+    *itertools.product((PENDULUM, REACHER), ('codetr', 'none'), ('lock-step', 'overlap')),
+    # the other methods once each, on either task and at either pace
+    (REACHER, 'rbt', 'overlap'),
+    (PENDULUM, 'rrd', 'lock-step'),
+    (PENDULUM, 'ircr', 'overlap'),
+    (REACHER, 'mlp', 'lock-step'),
+    (PENDULUM, 'uniform', 'overlap'),
 ]
 
 
@@ -38,7 +41,7 @@ def check_same(topics: dict[str, Any], calls: dict[str, Any]) -> None:
     assert topics['policy_sha256']
 
 
-@pytest.mark.parametrize(('task', 'method', 'pace'), PAIRS)
+@pytest.mark.parametrize(('task', 'method', 'pace'), CASES)
 def test_over_topics_and_in_process_end_with_the_same_weights(tmp_path, task, method, pace):
     settings = tiny(task=task, method=method, overlap=pace == 'overlap', delay=7)
     topics, _ = train(settings, tmp_path / 'topics')
