@@ -40,6 +40,7 @@ def tiny(**changes: Any) -> Settings:
         'codetr.first_gradient_steps': 5,
         'codetr.gradient_steps': 2,
         'rrd.hidden': (16,),
+        'rrd.subsequences': 4,
         'rrd.subsequence_steps': 5,
         'rrd.first_gradient_steps': 5,
         'rrd.gradient_steps': 2,
