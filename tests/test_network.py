@@ -13,6 +13,7 @@ from codetr_ros.learners.network import (
     ActingPolicy,
     Actor,
     NetworkError,
+    StandardisedActor,
     describe,
     linear_layers,
     weights_bytes,
@@ -138,6 +139,64 @@ def test_the_description_is_canonical_json_that_names_sizes_and_widths() -> None
     assert parsed['hidden'] == list(HIDDEN)
     assert description == json.dumps(parsed, sort_keys=True, separators=(',', ':'))
     assert len({describe(OBS, ACT, h) for h in (HIDDEN, HIDDEN[::-1], (32,), (32, 16, 16))}) == 4
+
+
+def stepwise(seen: np.ndarray, first: int, n: int) -> np.ndarray:
+    """Observations of consecutive steps, each with how far its segment of n steps is."""
+    places = (first + np.arange(len(seen))) % n / n
+    return np.concatenate([seen, places[:, None]], 1).astype(np.float32)
+
+
+def test_a_policy_that_sees_how_far_the_segment_is_counts_from_its_start() -> None:
+    torch.manual_seed(3)
+    actor = Actor(OBS + 1, ACT, HIDDEN)
+    published = record(actor, network=describe(OBS, ACT, HIDDEN, segment_steps=4))
+    policy = ActingPolicy.from_record(published, OBS, ACT, delay=4)
+    seen = observations(9)
+    with torch.no_grad():
+        mean, _ = actor(torch.from_numpy(stepwise(seen, 6, 4)))
+    acted = [policy.act(o, step=t) for t, o in enumerate(seen, 6)]
+    np.testing.assert_allclose(acted, mean.tanh().numpy(), atol=1e-6)
+    with pytest.raises(NetworkError, match='give it the number of the step'):
+        policy.act(seen[0])
+
+
+@pytest.mark.parametrize('named', ['4', '-4', '4.0', 'true', 'null', '"5"', '[5]'])
+def test_a_policy_for_other_segments_is_refused(named: str) -> None:
+    network = describe(OBS, ACT, HIDDEN, segment_steps=5).replace('s":5', f's":{named}')
+    published = record(Actor(OBS + 1, ACT, HIDDEN), network=network)
+    with pytest.raises(NetworkError, match=r'segments of .* steps, where they have 5'):
+        ActingPolicy.from_record(published, OBS, ACT, delay=5)
+
+
+def test_the_moments_of_the_observations_travel_with_the_policy() -> None:
+    torch.manual_seed(4)
+    actor = StandardisedActor(OBS, ACT, HIDDEN)
+    with torch.no_grad():
+        actor.mean.weight.mul_(100)
+        actor.log_std.copy_(torch.tensor([-1.0, 0.5, 0.0]))
+        actor.observation_mean.copy_(torch.linspace(-1, 1, OBS))
+        actor.observation_deviation.copy_(torch.linspace(0.01, 2, OBS))  # some beyond the clip
+    kind = 'standardised_tanh_gaussian_mlp'
+    published = record(actor, network=describe(OBS, ACT, HIDDEN, kind=kind))
+    policy = ActingPolicy.from_record(published, OBS, ACT)
+    seen = observations(9)
+    noise = np.random.default_rng(1).standard_normal((9, ACT)).astype(np.float32)
+    mean, deviation = np.linspace(-1, 1, OBS), np.linspace(0.01, 2, OBS)
+    x = torch.from_numpy(np.clip((seen - mean) / deviation, -10, 10)).float()
+    assert x.abs().max() == 10
+    for layer in linear_layers(actor)[:-1]:
+        x = torch.tanh(layer(x))
+    u = actor.mean(x) + actor.log_std.exp() * torch.from_numpy(noise)
+    acted = [policy.act(o, e) for o, e in zip(seen, noise, strict=True)]
+    np.testing.assert_allclose(acted, u.tanh().detach().numpy(), atol=1e-5)
+
+
+def test_a_policy_of_another_kind_is_another_architecture(actor: Actor) -> None:
+    for kind in ('"gru"', '["gru"]', 'null', '"standardised_tanh_gaussian_mlp"'):
+        network = describe(OBS, ACT, HIDDEN).replace('"tanh_gaussian_mlp"', kind)
+        with pytest.raises(NetworkError, match='another architecture'):
+            ActingPolicy.from_record(record(actor, network=network), OBS, ACT)
 
 
 def test_a_policy_for_another_task_is_refused_and_both_architectures_are_named(

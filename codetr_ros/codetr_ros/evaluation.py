@@ -60,7 +60,7 @@ class Evaluator:
             self._seen.add(INITIAL_VERSION)
             self._waiting.append(('random', INITIAL_VERSION, None))
         if settings.evaluated(policy.version) and policy.version not in self._seen:
-            acting = acting_policy(policy, self._environment)
+            acting = acting_policy(policy, self._environment, settings.delay)
             self._seen.add(policy.version)
             self._waiting.append(('evaluation', policy.version, acting))
 
@@ -89,9 +89,8 @@ class Evaluator:
             rng = generator(seed, 'evaluate', 'random', number)
             actions = uniform_actions(rng, environment.horizon, environment.action_size)
         while not episode.over:
-            episode.step(
-                actions[episode.length] if acting is None else acting.act(episode.observation)
-            )
+            t = episode.length
+            episode.step(actions[t] if acting is None else acting.act(episode.observation, step=t))
         self._counters.update(episodes=1, steps=episode.length)
         step = self._settings.steps_after(version)  # 0 for the initial version
         return episode.result(self._run.run_id, self._name, purpose, step, version, number)

@@ -154,17 +154,23 @@ def check_policy(policy: Record, run: RunSpec, settings: Settings, receiver: str
     return policy
 
 
-def acting_policy(policy: Policy, environment: Environment) -> ActingPolicy | None:
+def acting_policy(policy: Policy, environment: Environment, delay: int) -> ActingPolicy | None:
     """The policy to act with in an environment; None for the uniformly random one.
 
+    Args:
+        policy: what the learner published.
+        environment: what it is to act in.
+        delay: steps n of a segment.
+
     Raises:
-        RecordError: the weights are of another architecture, missing or not finite.
+        RecordError: the weights are of another architecture or for other segments, missing or not
+            finite.
     """
     if policy.random:
         return None
     try:
         return ActingPolicy.from_record(
-            policy, environment.observation_size, environment.action_size
+            policy, environment.observation_size, environment.action_size, delay
         )
     except NetworkError as error:
         raise RecordError(

@@ -107,7 +107,7 @@ class Simulator:
             )
         self._waiting[policy.phase] = (
             policy,
-            None if ends else acting_policy(policy, self._environment),
+            None if ends else acting_policy(policy, self._environment, self._settings.delay),
         )
 
     def work(self) -> Iterator[list[Record] | None]:
@@ -194,7 +194,7 @@ class Simulator:
         t = 0
         while t < most and not episode.over:
             if acting is not None:
-                actions[t] = acting.act(episode.observation, draws[t])
+                actions[t] = acting.act(episode.observation, draws[t], episode.length)
             rewards[t], score = episode.step(actions[t])
             t += 1
             observations[t] = episode.observation

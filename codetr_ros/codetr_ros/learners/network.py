@@ -8,6 +8,7 @@ import json
 import math
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import safetensors
 import safetensors.torch
@@ -18,6 +19,8 @@ from codetr_ros.records import F32, Policy
 
 LOG_STD_RANGE = (-10.0, 2.0)
 """Hard clip of the log standard deviation (jaxrl)."""
+OBSERVATION_CLIP = 10.0
+"""Standardised observations are clipped to this many deviations (baselines' VecNormalize)."""
 MAX_LAYERS = 8
 MAX_WIDTH = 65_536
 
@@ -26,19 +29,33 @@ class NetworkError(ValueError):
     """A policy that cannot be acted with: the message names what was expected and what came."""
 
 
-def describe(observation_size: int, action_size: int, hidden: Sequence[int]) -> str:
+def describe(
+    observation_size: int,
+    action_size: int,
+    hidden: Sequence[int],
+    segment_steps: int = 0,
+    kind: str = 'tanh_gaussian_mlp',
+) -> str:
     """The description of a policy network that goes into `Policy.network`: canonical JSON.
 
     Two networks have the same description exactly if the weights of one fit the other and mean the
     same.
+
+    Args:
+        observation_size: O of the task.
+        action_size: A of the task.
+        hidden: widths of the hidden layers.
+        segment_steps: steps n of a segment where the policy sees how far the segment is: (t - t_i)
+            / n for step t of a segment that began at t_i is then one more input; 0 where not.
+        kind: which network it is, a name in `KINDS`.
     """
     description = {
-        'kind': 'tanh_gaussian_mlp',
+        'kind': kind,
         'observation_size': observation_size,
         'action_size': action_size,
         'hidden': list(hidden),
-        'activation': 'relu',
-        'log_std_range': list(LOG_STD_RANGE),
+        'segment_steps': segment_steps,
+        **KINDS[kind].constants,
     }
     return json.dumps(description, sort_keys=True, separators=(',', ':'))
 
@@ -51,14 +68,13 @@ class Actor(nn.Module):
     biases are zero.
     """
 
+    constants = {'activation': 'relu', 'log_std_range': list(LOG_STD_RANGE)}
+
     def __init__(self, observation_size: int, action_size: int, hidden: Sequence[int]) -> None:
         super().__init__()
         self.action_size = action_size
-        sizes = [observation_size, *hidden]
-        self.body = nn.Sequential()
-        for inputs, outputs in pairwise(sizes):
-            self.body.extend([nn.Linear(inputs, outputs), nn.ReLU()])
-        self.heads = nn.Linear(sizes[-1], 2 * action_size)
+        self.body = _body(observation_size, hidden, nn.ReLU)
+        self.heads = nn.Linear(hidden[-1], 2 * action_size)
         for layer in linear_layers(self):
             nn.init.zeros_(layer.bias)
             if layer is not self.heads:
@@ -73,9 +89,63 @@ class Actor(nn.Module):
         return mean, log_std.clamp(*LOG_STD_RANGE)
 
 
-def linear_layers(actor: Actor) -> list[nn.Linear]:
-    """The layers with weights, from the observation to the heads."""
-    return [layer for layer in actor.modules() if isinstance(layer, nn.Linear)]
+class StandardisedActor(nn.Module):
+    """A Gaussian over actions before their squash by tanh, for standardised observations.
+
+    The standard deviation is the same in every state. The moments of the observations are no
+    parameters, but travel with them. Initial weights are orthogonal, with gain sqrt(2) in the
+    network and 0.01 for the mean (as baselines' MlpPolicy has them, recalled); biases and log
+    standard deviations are zero.
+    """
+
+    constants = {'activation': 'tanh', 'observation_clip': OBSERVATION_CLIP}
+    observation_mean: Tensor
+    observation_deviation: Tensor
+
+    def __init__(self, observation_size: int, action_size: int, hidden: Sequence[int]) -> None:
+        super().__init__()
+        self.body = _body(observation_size, hidden, nn.Tanh)
+        self.mean = nn.Linear(hidden[-1], action_size)
+        self.log_std = nn.Parameter(torch.zeros(action_size))
+        self.register_buffer('observation_mean', torch.zeros(observation_size))
+        self.register_buffer('observation_deviation', torch.ones(observation_size))
+        orthogonal(self.body, math.sqrt(2))
+        orthogonal(self.mean, 0.01)
+
+    def forward(self, observations: Tensor) -> tuple[Tensor, Tensor]:
+        """Means (B, A) for standardised observations (B, O), and log standard deviations (A,)."""
+        return self.mean(self.body(observations)), self.log_std
+
+
+KINDS: dict[str, type[Actor | StandardisedActor]] = {
+    'tanh_gaussian_mlp': Actor,
+    'standardised_tanh_gaussian_mlp': StandardisedActor,
+}
+"""Policy networks by the name that a description gives them."""
+
+
+def _body(inputs: int, hidden: Sequence[int], activation: type[nn.Module]) -> nn.Sequential:
+    body = nn.Sequential()
+    for width, following in pairwise([inputs, *hidden]):
+        body.extend([nn.Linear(width, following), activation()])
+    return body
+
+
+def orthogonal(network: nn.Module, gain: float) -> None:
+    """Give the linear layers of a network orthogonal weights of this gain, and zero biases."""
+    for layer in linear_layers(network):
+        nn.init.orthogonal_(layer.weight, gain)
+        nn.init.zeros_(layer.bias)
+
+
+def standardise(observations: Tensor, mean: Tensor, deviation: Tensor) -> Tensor:
+    """Observations (..., O) in deviations from the mean, clipped."""
+    return ((observations - mean) / deviation).clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP)
+
+
+def linear_layers(network: nn.Module) -> list[nn.Linear]:
+    """The layers with weights, from the observation to the actions."""
+    return [layer for layer in network.modules() if isinstance(layer, nn.Linear)]
 
 
 def weights_bytes(actor: nn.Module) -> bytes:
@@ -89,14 +159,26 @@ class ActingPolicy:
     The same weights, observation and noise give the same bits in every process (of one CPU type
     and thread count): the weights are copied into memory of their own, because the last bit of a
     product with one row depends on where its matrix lies, and a received message lies anywhere.
+
+    Args:
+        actor: the network.
+        segment_steps: as in `describe`.
     """
 
-    def __init__(self, actor: Actor) -> None:
+    def __init__(self, actor: Actor | StandardisedActor, segment_steps: int = 0) -> None:
         self.layers = [(_own(layer.weight), _own(layer.bias)) for layer in linear_layers(actor)]
+        self._segment_steps = segment_steps
+        self._activate = torch.relu_
+        self._log_std: Tensor | None = None
+        self._moments: tuple[Tensor, Tensor] | None = None
+        if isinstance(actor, StandardisedActor):
+            self._activate = torch.tanh_
+            self._log_std = _own(actor.log_std)
+            self._moments = _own(actor.observation_mean), _own(actor.observation_deviation)
 
     @classmethod
     def from_record(
-        cls, policy: Policy, observation_size: int, action_size: int
+        cls, policy: Policy, observation_size: int, action_size: int, delay: int = 0
     ) -> 'ActingPolicy':
         """The policy that a record carries.
 
@@ -104,18 +186,22 @@ class ActingPolicy:
             policy: what the learner published. The widths of its layers are its own affair.
             observation_size: O of the task that it is to act in.
             action_size: A of that task.
+            delay: steps n of the segments into which episodes are cut; 0 where they are not.
 
         Raises:
-            NetworkError: the policy is of another architecture, or its weights are missing,
-                unknown, of another shape or type, not finite, or not safetensors at all.
+            NetworkError: the policy is of another architecture or for other segments, or its
+                weights are missing, unknown, of another shape or type, not finite, or not
+                safetensors at all.
         """
         name = f'policy of phase {policy.phase}, version {policy.version}'
         if policy.random:
             raise NetworkError(
                 f'{name} is random and has no weights: draw its actions uniformly from [-1, 1]'
             )
-        hidden = _hidden(policy.network, name)
-        expected = describe(observation_size, action_size, hidden)
+        said = _parse(policy.network, name)
+        hidden, segment_steps = _hidden(said, name), _segment_steps(said, name, delay)
+        kind = next((kind for kind in KINDS if kind == said.get('kind')), 'tanh_gaussian_mlp')
+        expected = describe(observation_size, action_size, hidden, segment_steps, kind)
         if policy.network != expected:
             raise NetworkError(
                 f'{name} is of another architecture: this task needs {expected}, '
@@ -129,30 +215,45 @@ class ActingPolicy:
                 f'{name}: its {len(policy.weights)} bytes of weights are not safetensors: {error}'
             ) from None
         with torch.device('meta'):
-            actor = Actor(observation_size, action_size, hidden)
+            actor = KINDS[kind](observation_size + (segment_steps > 0), action_size, hidden)
         _check(tensors, actor.state_dict(), name)
         actor.load_state_dict(tensors, assign=True)
-        return cls(actor)
+        return cls(actor, segment_steps)
 
-    def act(self, observation: F32, noise: F32 | None = None) -> F32:
+    def act(self, observation: F32, noise: F32 | None = None, step: int | None = None) -> F32:
         """The action for one observation.
 
         Args:
             observation: (O,), finite.
             noise: (A,) standard normal numbers; None for the deterministic action.
+            step: number of the step in its episode; a policy that sees how far the segment is
+                needs it.
 
         Returns:
             (A,) in [-1, 1]: tanh(mean), or tanh(mean + std * noise).
+
+        Raises:
+            NetworkError: the policy needs to know the step, and it was not said.
         """
         x = torch.from_numpy(observation)
+        if self._segment_steps:
+            if step is None:
+                raise NetworkError(
+                    'this policy sees how far the segment is: give it the number of the step in '
+                    'its episode'
+                )
+            place = step % self._segment_steps / self._segment_steps
+            x = torch.cat([x, torch.tensor([place])])
+        if self._moments is not None:
+            x = standardise(x, *self._moments)
         for weight, bias in self.layers[:-1]:
-            x = torch.addmv(bias, weight, x).relu_()
+            x = self._activate(torch.addmv(bias, weight, x))
         weight, bias = self.layers[-1]
-        mean, log_std = torch.addmv(bias, weight, x).chunk(2)
+        out = torch.addmv(bias, weight, x)
+        mean, log_std = out.chunk(2) if self._log_std is None else (out, self._log_std)
         if noise is not None:
-            mean = torch.addcmul(
-                mean, log_std.clamp(*LOG_STD_RANGE).exp_(), torch.from_numpy(noise)
-            )
+            std = log_std.clamp(*LOG_STD_RANGE).exp_()
+            mean = torch.addcmul(mean, std, torch.from_numpy(noise))
         action: F32 = mean.tanh().clamp_(-1.0, 1.0).numpy()
         return action
 
@@ -162,15 +263,23 @@ def _own(tensor: Tensor) -> Tensor:
     return torch.empty(tensor.shape, dtype=tensor.dtype).copy_(tensor.detach())
 
 
-def _hidden(network: str, name: str) -> list[int]:
-    """Hidden widths that a description names."""
+def _parse(network: str, name: str) -> dict[str, Any]:
+    """What a description says."""
     try:
-        hidden = json.loads(network)['hidden']
-    except (ValueError, TypeError, KeyError):
+        said = json.loads(network)
+        if not isinstance(said, dict) or not {'hidden', 'segment_steps'} <= said.keys():
+            raise ValueError
+    except ValueError:
         raise NetworkError(
             f"{name}: its network description is not one of this version's: {network!r}; "
             f'expected something like {describe(1, 1, [256, 256])}'
         ) from None
+    return said
+
+
+def _hidden(said: dict[str, Any], name: str) -> list[int]:
+    """Hidden widths that a description names."""
+    hidden = said['hidden']
     if (
         not isinstance(hidden, list)
         or not 1 <= len(hidden) <= MAX_LAYERS
@@ -181,6 +290,17 @@ def _hidden(network: str, name: str) -> list[int]:
             f'allowed are 1 to {MAX_LAYERS} whole numbers from 1 to {MAX_WIDTH}'
         )
     return hidden
+
+
+def _segment_steps(said: dict[str, Any], name: str, delay: int) -> int:
+    """Steps of the segments that a description is for; 0 where it does not matter."""
+    steps = said['segment_steps']
+    if type(steps) is not int or steps not in (0, delay):
+        raise NetworkError(
+            f'{name}: its network description names segments of {steps!r} steps, where they have '
+            f'{delay}: learner and simulator need the same setting delay'
+        )
+    return steps
 
 
 def _check(tensors: dict[str, Tensor], expected: dict[str, Tensor], name: str) -> None:
