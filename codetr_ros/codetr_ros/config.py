@@ -21,11 +21,11 @@ from codetr_ros.records import PROTOCOL_VERSION, RunSpec
 Composite = Literal[
     'sum', 'sum_square', 'square_sum', 'max', 'max_hard', 'max_log_sum_exp', 'max_times_n'
 ]
-Method = Literal['codetr', 'none', 'rbt', 'rrd', 'ircr', 'mlp', 'uniform', 'true', 'ones']
+Method = Literal['codetr', 'none', 'rbt', 'rrd', 'ircr', 'hc', 'mlp', 'uniform', 'true', 'ones']
 Hidden = tuple[Annotated[int, Field(ge=1, le=65536)], ...]
 IN_PROCESS_ONLY: tuple[str, ...] = ('true', 'ones')
 """Reference methods: they look at what no node may see (`true`) or ignore the scores (`ones`)."""
-SCORE_LEARNERS: tuple[str, ...] = ()
+SCORE_LEARNERS: tuple[str, ...] = ('hc',)
 """Methods whose policy learner learns from the composite rewards themselves: no reward node labels
 steps for it."""
 PRESETS = ('quick', 'cpu', 'paper')
@@ -234,6 +234,29 @@ class SacSettings(Group):
     )
 
 
+class HcSettings(Group):
+    """The critic of method `hc` (section 7 of the method); the rest of it is `sac`'s."""
+
+    history: Literal['singleton', 'recurrent'] = Field(
+        'recurrent',
+        description='value of the history: a sum over its steps, or of a GRU that reads it',
+    )
+    regulariser: float = Field(
+        5.0,
+        ge=0,
+        le=1e6,
+        description="weight of (H(whole segment) - score)^2 in the critics' loss; 0: none",
+    )
+    width: int = Field(128, ge=1, le=65536, description='width of the GRU')
+    segments: int = Field(
+        16,
+        ge=1,
+        le=65536,
+        description='segments from which the sac.batch steps of an update are drawn '
+        '(decided here)',
+    )
+
+
 class Settings(Group):
     """Everything that the nodes of a run must agree on."""
 
@@ -311,6 +334,7 @@ class Settings(Group):
         default_factory=MlpSettings, description='the reward model of single steps'
     )
     sac: SacSettings = Field(default_factory=SacSettings, description='the policy learner')
+    hc: HcSettings = Field(default_factory=HcSettings, description='the critic of method hc')
 
     @property
     def labels_steps(self) -> bool:

@@ -121,7 +121,7 @@ class Transitions:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CompositeReward:
-    """The score of one segment. From whoever scores to recorder and reward."""
+    """The score of one segment. From whoever scores to recorder, reward or learner."""
 
     run_id: str
     source: str  # whose segment it is

@@ -442,6 +442,15 @@ class Trajectories:
             for _, source, _, at in self._by_source(ids)
         ]
 
+    def terminal(self, ids: I64) -> NDArray[np.bool_]:
+        """Which segments (B,) ended in a terminal state."""
+        spans = self._spans(ids)
+        found = np.empty(len(ids), np.bool_)
+        for _, source, mine, _ in self._by_source(ids):
+            ends = spans[mine, 0] + spans[mine, 1] - 1
+            found[mine] = source.terminated[ends % source.capacity]
+        return found
+
     def score_scale(self) -> float:
         """Root mean square of the composite reward per step over all scored segments; 1 where that
         is 0.

@@ -1,17 +1,24 @@
 """The nodes of a run in one namespace: `ros2 launch codetr_ros train.launch.py config:=quick`.
 
-They start in any order and wait for each other; the launch ends when the recorder has, which is
-last. There is one simulator: a run with the setting `simulators` above 1 waits until the others
-are started by hand, each with a name of its own, `ros2 run sim_node sim --ros-args -r
-__ns:=/codetr -r __node:=sim_2`.
+Which ones the run needs follows from its settings. They start in any order and wait for each
+other; the launch ends when the recorder has, which is last. There is one simulator: a run with the
+setting `simulators` above 1 waits until the others are started by hand, each with a name of its
+own, `ros2 run sim_node sim --ros-args -r __ns:=/codetr -r __node:=sim_2`.
 """
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, EmitEvent, RegisterEventHandler
+from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
+from launch.actions import (
+    DeclareLaunchArgument,
+    EmitEvent,
+    OpaqueFunction,
+    RegisterEventHandler,
+)
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+
+from codetr_ros.config import load
 
 ARGUMENTS = {
     'namespace': ('codetr', 'namespace of the run; each run needs one of its own'),
@@ -29,11 +36,12 @@ NODES = (
 )
 
 
-def generate_launch_description() -> LaunchDescription:
-    """Start the nodes; only the learner is told what to do, the others take it from the run."""
+def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
+    """The nodes; only the learner is told what to do, the others take it from the run."""
     value = {name: LaunchConfiguration(name) for name in ARGUMENTS}
     shared = {name: value[name] for name in ('folder', 'run_id', 'peer_deadline')}
-    nodes = {
+    needed = load(value['config'].perform(context)).roles
+    found = {
         executable: Node(
             package=package,
             executable=executable,
@@ -43,15 +51,21 @@ def generate_launch_description() -> LaunchDescription:
             parameters=[shared | ({'config': value['config']} if executable == 'learner' else {})],
         )
         for package, executable in NODES
+        if executable in needed
     }
+    end = RegisterEventHandler(
+        OnProcessExit(
+            target_action=found['record'],
+            on_exit=[EmitEvent(event=Shutdown(reason='the run is over'))],
+        )
+    )
+    return [*found.values(), end]
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Declare the arguments, and start the nodes once they are known."""
     declared = [
         DeclareLaunchArgument(name, default_value=default, description=description)
         for name, (default, description) in ARGUMENTS.items()
     ]
-    end = RegisterEventHandler(
-        OnProcessExit(
-            target_action=nodes['record'],
-            on_exit=[EmitEvent(event=Shutdown(reason='the run is over'))],
-        )
-    )
-    return LaunchDescription([*declared, *nodes.values(), end])
+    return LaunchDescription([*declared, OpaqueFunction(function=nodes)])

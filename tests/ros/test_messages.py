@@ -2,7 +2,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from builders import same, transitions
+from builders import run, same, tiny, transitions
 from builtin_interfaces.msg import Time
 from rclpy.serialization import deserialize_message, serialize_message
 
@@ -128,16 +128,32 @@ def test_every_topic_has_a_quality_of_service_readers_and_writers():
     assert set(peers.READERS) == set(peers.WRITERS) == topics - {'presence'}
 
 
-def test_the_roles_that_read_a_topic_are_those_whose_cores_want_it():
+@pytest.mark.parametrize('method', ['codetr', 'hc'])
+def test_the_roles_that_read_a_topic_are_those_whose_cores_want_it(method):
     from codetr_ros.evaluation import Evaluator
     from codetr_ros.learners.core import Learner
     from codetr_ros.rewards.core import Labeller
     from codetr_ros.simulator import Simulator
 
-    cores = {'sim': Simulator, 'evaluate': Evaluator, 'reward': Labeller, 'learner': Learner}
-    for role, core in cores.items():
-        wanted = {TOPICS[kind] for kind in core.subscribes} - {'run'}
-        assert wanted == {t for t, roles in peers.READERS.items() if role in roles and t != 'run'}
+    settings = tiny(method=method)
+    spec = run(settings)
+    wanted = {
+        'sim': Simulator.subscribes,
+        'evaluate': Evaluator.subscribes,
+        'reward': Labeller.subscribes,
+        'learner': Learner(spec, settings, 'learner', None).subscribes,
+    }
+    readers = peers.readers(settings)
+    for role in settings.roles.keys() & wanted:
+        topics = {TOPICS[kind] for kind in wanted[role]} - {'run'}
+        assert topics == {t for t, roles in readers.items() if role in roles and t != 'run'}
+
+
+def test_a_run_that_learns_from_scores_itself_needs_no_reward_node():
+    assert 'reward' in tiny().roles
+    assert tiny(method='hc', simulators=2).roles == {
+        'sim': 2, 'evaluate': 1, 'record': 1, 'learner': 1,
+    }  # fmt: skip
 
 
 def test_queues_are_deeper_than_what_the_permitted_phases_can_hold():

@@ -61,6 +61,27 @@ def test_another_seed_pace_or_method_ends_with_other_weights():
     assert len(digests) == len(changes)
 
 
+@pytest.mark.parametrize(
+    ('task', 'history', 'overlap'),
+    [(PENDULUM, 'singleton', True), (REACHER, 'recurrent', False)],
+)
+def test_a_learner_of_scores_ends_with_the_same_weights_without_a_reward_node(
+    tmp_path, task, history, overlap
+):
+    settings = tiny(
+        task=task, method='hc', delay=7, overlap=overlap, hc__history=history, hc__width=8
+    )
+    topics, _ = train(settings, tmp_path / 'topics')
+    calls = by_calls(settings)
+    check_same(topics, calls)
+    assert topics['processes'].keys() - {'codetr'} == {
+        'sim-sim', 'evaluate-evaluate', 'record-record', 'learner-learner',
+    }  # fmt: skip
+    assert topics['updates'] == calls['updates'] == 1000
+    assert topics['messages']['step_rewards']['published'] == 0
+    assert topics['lost'] == topics['refused'] == 0
+
+
 def test_two_simulators_over_topics_equal_two_in_process(tmp_path):
     settings = tiny(simulators=2, task=REACHER)
     topics, _ = train(settings, tmp_path / 'topics')

@@ -4,9 +4,10 @@ from collections.abc import Callable
 
 from codetr_ros.config import Settings
 from codetr_ros.learners.from_labels import FromLabels
+from codetr_ros.learners.hc import HC
 from codetr_ros.learners.learner import PolicyLearner
 
-METHODS: dict[str, Callable[[Settings, int, int], PolicyLearner]] = {}
+METHODS: dict[str, Callable[[Settings, int, int], PolicyLearner]] = {'hc': HC}
 """Policy learners by the name that `settings.method` gives them. Every other method is one of
 rewards: it labels steps, and SAC learns from the labels."""
 
