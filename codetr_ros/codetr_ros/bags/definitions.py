@@ -103,22 +103,29 @@ def _described(fields: Fielddefs) -> list[str]:
     return [f'{kind(node)} {name}' for name, node in fields]
 
 
-@cache
 def check_own(name: str, definition: Definition) -> None:
     """Refuse a bag whose definition of one of our types is not the one that we read by.
 
     Raises:
         BagError: names the type, and the first field that differs.
     """
+    if text := _difference(name, definition):
+        raise BagError(f'{text}: read it with the version that wrote it')
+
+
+@cache
+def _difference(name: str, definition: Definition) -> str:
     store = own_types()
     if not definition.encoding:
-        if definition.digest and definition.digest != store.hash_rihs01(name):
-            raise BagError(
-                f'{name} has the hash {definition.digest}, this version reads '
-                f'{store.hash_rihs01(name)}: read it with the version that wrote it'
-            )
-        return
-    for contained, (_, given) in parsed(name, definition).items():
+        expected = store.hash_rihs01(name)
+        if definition.digest in ('', expected):
+            return ''
+        return f'{name} has the hash {definition.digest}, this version reads {expected}'
+    try:
+        types = parsed(name, definition)
+    except BagError as error:
+        return str(error)
+    for contained, (_, given) in types.items():
         if contained not in store.fielddefs:
             continue
         ours, theirs = _described(store.fielddefs[contained][1]), _described(given)
@@ -126,10 +133,11 @@ def check_own(name: str, definition: Definition) -> None:
             here = ours[i] if i < len(ours) else 'nothing'
             there = theirs[i] if i < len(theirs) else 'nothing'
             if here != there:
-                raise BagError(
+                return (
                     f'{contained} is defined otherwise: field {i + 1} is {there!r} there, '
-                    f'{here!r} in this version: read it with the version that wrote it'
+                    f'{here!r} in this version'
                 )
+    return ''
 
 
 @cache

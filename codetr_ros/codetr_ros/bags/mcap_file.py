@@ -18,6 +18,7 @@ from mcap.opcode import Opcode
 
 from codetr_ros.bags.definitions import Definition
 from codetr_ros.bags.errors import BagError, Damage, Place
+from codetr_ros.bags.mcap_index import IndexChecks
 from codetr_ros.bags.mcap_layout import (
     CHUNK,
     HEAD,
@@ -70,6 +71,7 @@ class McapFile:
         on_damage: is told what is wrong, and reading goes on at the next chunk. By default the
             first fault is an error.
         shown: what it is called in places and errors, where it has been unpacked.
+        thorough: compare indexes, summary and the checksums over both too.
 
     Attributes:
         library: who wrote it, as the file says.
@@ -81,7 +83,11 @@ class McapFile:
     """
 
     def __init__(
-        self, path: Path, on_damage: OnDamage | None = None, shown: Path | None = None
+        self,
+        path: Path,
+        on_damage: OnDamage | None = None,
+        shown: Path | None = None,
+        thorough: bool = False,
     ) -> None:
         self.path = path
         self.shown = shown or path
@@ -91,6 +97,7 @@ class McapFile:
         self.unchecked = 0
         self.finished = False
         self._on_damage = on_damage
+        self._checks = IndexChecks(MAGIC) if thorough else None
         self._schemas: dict[int, Any] = {}
         self._channels: dict[int, Channel] = {}
         self._said: dict[int, Any] = {}
@@ -114,6 +121,11 @@ class McapFile:
         except OSError as error:
             raise BagError(f'{self.shown} cannot be read: {error.strerror}') from error
 
+    def _compare(self, at: int, texts: Iterator[str]) -> None:
+        """Say what an index has wrong: no message is by that."""
+        for text in texts:
+            self._say(at, text, 0, harmless=True)
+
     def _say(self, offset: int, text: str, lost: int, harmless: bool = False) -> None:
         damage = Damage(Place(self.shown, offset), text, lost, harmless)
         if self._on_damage is not None:
@@ -131,7 +143,7 @@ class McapFile:
         ended = False
         while at < size:
             try:
-                opcode, content = self._next(file, at, size)
+                opcode, content = self._next(file, at, size, ended)
                 if ended:
                     if self._end(file, at, opcode, content, size):
                         return
@@ -140,7 +152,7 @@ class McapFile:
                 elif opcode == Opcode.MESSAGE:
                     yield self._lone_message(at, content)
                 else:
-                    ended = self._small(opcode, content)
+                    ended = self._small(at, opcode, content)
                 at += HEAD.size + len(content)
             except FaultError as fault:
                 after = resume_at(file, at, size)
@@ -150,7 +162,7 @@ class McapFile:
             file.seek(at)
         self._say(size, 'the file ends here, without its index: its writer was killed', 0)
 
-    def _next(self, file: BinaryIO, at: int, size: int) -> tuple[int, bytes]:
+    def _next(self, file: BinaryIO, at: int, size: int, ended: bool) -> tuple[int, bytes]:
         head = file.read(HEAD.size)
         if len(head) < HEAD.size:
             raise FaultError(f'cut off within a record: {len(head)} bytes are left')
@@ -162,11 +174,13 @@ class McapFile:
             raise FaultError(f'a record of {length} bytes where {left} are left')
         if length > LARGEST_RECORD:
             raise FaultError(f'a record of {length} bytes: at most {LARGEST_RECORD} are read')
-        return opcode, file.read(length)
+        content = file.read(length)
+        if self._checks is not None and opcode not in (Opcode.DATA_END, Opcode.FOOTER):
+            (self._checks.summary if ended else self._checks.data)(head, content)
+        return opcode, content
 
     def _chunk(self, at: int, content: bytes) -> Iterator[RawMessage]:
         start, end, size, crc, named = chunk_head(content)
-        del start, end
         name = bytes(content[CHUNK.size : CHUNK.size + named])
         data = memoryview(content)[CHUNK.size + named + 8 :]
         if size > LARGEST_RECORD:
@@ -183,7 +197,11 @@ class McapFile:
         self.chunks += 1
         self.unchecked += not crc
         self._indexed = Counter()
+        if self._checks is not None:
+            self._checks.forget()
         yield from self._in(at, memoryview(raw), self._indexed)
+        if self._checks is not None:
+            self._compare(at, self._checks.chunk(at, HEAD.size + len(content), start, end))
 
     def _in(self, at: int, raw: memoryview, counts: Counter[int]) -> Iterator[RawMessage]:
         place, size = 0, len(raw)
@@ -197,7 +215,7 @@ class McapFile:
                 if end > size:
                     raise FaultError(f'a record of {length} bytes at byte {place} of it')
                 if opcode != Opcode.MESSAGE:
-                    self._small(opcode, bytes(raw[place + HEAD.size : end]))
+                    self._small(at, opcode, bytes(raw[place + HEAD.size : end]))
                     place = end
                     continue
                 if length < MESSAGE_BODY:
@@ -213,6 +231,8 @@ class McapFile:
                 self._say(at, f'a chunk is damaged inside: {fault}', size - place)
                 return
             counts[number] += 1
+            if self._checks is not None:
+                self._checks.message(number, log_time, place)
             self._count(number, channel)
             yield RawMessage(
                 channel, log_time, published, sequence, raw[begin:end], Place(path, at, place)
@@ -237,7 +257,7 @@ class McapFile:
             channel, log_time, published, sequence, memoryview(content)[MESSAGE_BODY:], place
         )
 
-    def _small(self, opcode: int, content: bytes) -> bool:
+    def _small(self, at: int, opcode: int, content: bytes) -> bool:
         """Take note of a record that is neither message nor chunk; whether the data ends here."""
         kind = SMALL.get(Opcode(opcode)) if opcode in Opcode.__members__.values() else None
         if kind is None:
@@ -259,6 +279,10 @@ class McapFile:
                     f'the index names {len(record.records)} messages of channel '
                     f'{record.channel_id}, its chunk has {found}'
                 )
+            if self._checks is not None and found is not None:
+                self._compare(at, self._checks.message_index(record))
+        elif self._checks is not None and isinstance(record, mcap_records.DataEnd):
+            self._compare(at, self._checks.data_end(record))
         return isinstance(record, mcap_records.DataEnd)
 
     def _describe(self, known: dict[int, Any], record: Any) -> None:
@@ -286,8 +310,10 @@ class McapFile:
     def _end(self, file: BinaryIO, at: int, opcode: int, content: bytes, size: int) -> bool:
         """Check a record of the summary; whether it is the file's last."""
         if opcode == Opcode.FOOTER:
-            parse_record(mcap_records.Footer, content)
+            footer = parse_record(mcap_records.Footer, content)
             self.finished = True
+            if self._checks is not None:
+                self._compare(at, self._checks.footer(footer))
             rest = file.read(len(MAGIC) + 1)
             if rest != MAGIC:
                 self._say(at, f'the file goes on with {rest!r} after its end', 0, harmless=True)
@@ -299,4 +325,6 @@ class McapFile:
             said, found = record.message_count, self._ids.total()
             if said != found:
                 self._say(at, f'the file counts {said} messages, {found} were read', 0)
+        elif self._checks is not None and isinstance(record, mcap_records.ChunkIndex):
+            self._compare(at, self._checks.chunk_index(record))
         return False

@@ -2,8 +2,10 @@
 
 import os
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path, PurePath
+from typing import Any
 
 import yaml
 
@@ -12,6 +14,8 @@ from codetr_ros.bags.topics import BagTopic, type_hash
 METADATA = 'metadata.yaml'
 VERSION = 9
 """Of the file's layout, as rosbag2 of Jazzy writes it."""
+LONGEST = 16 << 20
+"""Bytes of the file that are read."""
 
 
 @dataclass
@@ -81,3 +85,69 @@ def render(files: Sequence[BagFile], topics: Iterable[BagTopic]) -> str:
         'ros_distro': os.environ.get('ROS_DISTRO', 'jazzy'),
     }
     return yaml.safe_dump({'rosbag2_bagfile_information': information}, sort_keys=False)
+
+
+def check(
+    folder: Path, found: Mapping[str, tuple[str, int]], files: Mapping[str, int]
+) -> Iterator[str]:
+    """What a bag's `metadata.yaml` says that is not so.
+
+    Args:
+        folder: the bag.
+        found: type and number of messages of each topic.
+        files: messages in each file, by its name.
+
+    Yields:
+        One sentence for each contradiction.
+    """
+    path = folder / METADATA
+    if not path.exists():
+        yield f'{METADATA} is missing: `ros2 bag` does not open the bag without it'
+        return
+    try:
+        said = yaml.safe_load(path.read_bytes()[:LONGEST])['rosbag2_bagfile_information']
+        yield from _contradictions(said, found, files)
+    except (
+        OSError,
+        yaml.YAMLError,
+        LookupError,
+        TypeError,
+        ValueError,
+        RecursionError,
+        AttributeError,
+    ) as error:
+        yield f'{METADATA} cannot be read: {str(error) or type(error).__name__}'
+
+
+def _contradictions(
+    said: Mapping[str, Any], found: Mapping[str, tuple[str, int]], files: Mapping[str, int]
+) -> Iterator[str]:
+    if not 1 <= int(said['version']) <= VERSION:
+        yield f'{METADATA} is of version {said["version"]}, known are 1 to {VERSION}'
+    storage = {'mcap': '.mcap', 'sqlite3': '.db3'}.get(said['storage_identifier'])
+    if not storage or not all(storage in name for name in files):
+        yield f'{METADATA} says that the files are {said["storage_identifier"]}'
+    listed = [PurePath(name).name for name in said['relative_file_paths']]
+    for name in files.keys() - set(listed):
+        yield f'{METADATA} does not list {name}'
+    total = sum(files.values())
+    if said['message_count'] != total:
+        yield f'{METADATA} counts {said["message_count"]} messages, there are {total}'
+    for file in said.get('files') or ():
+        name = PurePath(file['path']).name
+        if name in files and file['message_count'] != files[name]:
+            yield (
+                f'{METADATA} counts {file["message_count"]} messages in {name}, there are '
+                f'{files[name]}'
+            )
+    topics = {}
+    for topic in said['topics_with_message_count']:
+        kind = topic['topic_metadata']['type']
+        topics[topic['topic_metadata']['name']] = kind, topic['message_count']
+    for name in sorted(topics.keys() | found.keys()):
+        there, told = found.get(name, ('', 0)), topics.get(name, ('', 0))
+        if there[1] != told[1] or (there[0] and told[0] and there[0] != told[0]):
+            yield (
+                f'{METADATA} has {told[1]} messages of {name} ({told[0] or "no type"}), there are '
+                f'{there[1]} ({there[0] or "no type"})'
+            )

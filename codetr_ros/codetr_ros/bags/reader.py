@@ -6,20 +6,16 @@ every chunk's CRC is checked, every definition compared, and the first fault is 
 the caller asks to be told of faults and to go on (`on_damage`).
 """
 
-import os
-import re
 import shutil
-import stat
 import tempfile
 from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any, NamedTuple
 
-import yaml
 import zstandard
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_typestore
@@ -27,16 +23,14 @@ from rosbags.typesys.store import Typestore
 
 from codetr_ros.bags.definitions import Definition, check_own, decode, parsed
 from codetr_ros.bags.errors import BagError, Damage, Place
+from codetr_ros.bags.files import COMPRESSED, bag_files
 from codetr_ros.bags.mcap_file import McapFile, OnDamage, RawMessage
 from codetr_ros.bags.mcap_layout import LARGEST_RECORD
-from codetr_ros.bags.metadata import METADATA
 from codetr_ros.bags.sqlite_file import SqliteFile
 from codetr_ros.received import RECORD_TYPES, type_name
 from codetr_ros.records import Record, RecordError
 
 _KINDS: dict[str, type[McapFile | SqliteFile]] = {'.mcap': McapFile, '.db3': SqliteFile}
-_COMPRESSED = '.zstd'
-_LONGEST_METADATA = 16 << 20
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'  # no CDR message begins so
 _UNREADABLE = (SerdeError, TypesysError, LookupError, OverflowError, RecursionError)
 
@@ -81,15 +75,27 @@ class Bag:
         on_damage: is told of each fault, and reading goes on behind it: for bags of killed
             recorders. By default the first fault is an error, the missing end of a killed
             recorder's file among them; every message before it has been given out by then.
+        thorough: compare indexes and summaries too, which nothing is read from.
+
+    Attributes:
+        files: its files, in order.
+        in_files: messages in each, by name, as far as the bag has been read.
+        unchecked: chunks and messages read that carry no CRC: a bit changed in them goes unnoticed
+            where it leaves a possible message behind.
 
     Raises:
         BagError: there is no bag there, it cannot be read, or a file of it is missing.
     """
 
-    def __init__(self, path: Path | str, on_damage: OnDamage | None = None) -> None:
+    def __init__(
+        self, path: Path | str, on_damage: OnDamage | None = None, thorough: bool = False
+    ) -> None:
         self.path = Path(path)
         self.on_damage = on_damage
-        self.files = _files(self.path, on_damage)
+        self.thorough = thorough
+        self.in_files: dict[str, int] = {}
+        self.unchecked = 0
+        self.files = bag_files(self.path, on_damage)
         self._topics: dict[str, Topic] | None = None
 
     def entries(self, kinds: Collection[type[Record]] | None = None) -> Iterator[Entry]:
@@ -168,15 +174,18 @@ class Bag:
         types: dict[str, str] = {}
         counts: Counter[str] = Counter()
         sizes: Counter[str] = Counter()
+        self.in_files, self.unchecked = {}, 0
         for path in self.files:
             with ExitStack() as stack:
-                opened = open_file(path, stack, self.on_damage)
+                opened = open_file(path, stack, self.on_damage, self.thorough)
                 for packed in opened.messages():
                     message = self._unpacked(packed)
                     if message is not None:
                         sizes[message.channel.topic] += len(message.data)
                         yield message
                 counts += opened.counts
+                self.in_files[path.name] = opened.counts.total()
+                self.unchecked += opened.unchecked
                 types |= {channel.topic: channel.type for channel in opened.channels()}
         self._topics = {
             name: Topic(name, kind, counts[name], sizes[name])
@@ -226,7 +235,7 @@ class Bag:
 
 
 def open_file(
-    path: Path, stack: ExitStack, on_damage: OnDamage | None = None
+    path: Path, stack: ExitStack, on_damage: OnDamage | None = None, thorough: bool = False
 ) -> McapFile | SqliteFile:
     """One file of a bag; a compressed one is first unpacked beside other temporary files, until
     the stack is closed.
@@ -234,8 +243,8 @@ def open_file(
     Raises:
         BagError: it cannot be read or unpacked.
     """
-    if path.suffix != _COMPRESSED:
-        return _KINDS[path.suffix](path, on_damage)
+    if path.suffix != COMPRESSED:
+        return _KINDS[path.suffix](path, on_damage, thorough=thorough)
     folder = stack.enter_context(tempfile.TemporaryDirectory(prefix='codetr-bag-'))
     unpacked = Path(folder) / path.stem
     try:
@@ -248,7 +257,7 @@ def open_file(
         if on_damage is None:
             raise damage.error() from None
         on_damage(damage)
-    return _KINDS[unpacked.suffix](unpacked, on_damage, shown=path)
+    return _KINDS[unpacked.suffix](unpacked, on_damage, path, thorough)
 
 
 def _decompressed(data: bytes | memoryview) -> bytes:
@@ -274,84 +283,3 @@ def _typestore(name: str, definition: Definition) -> Typestore:
     except _UNREADABLE as error:
         raise BagError(f'the definition of {name} cannot be used: {error}') from error
     return store
-
-
-# ------------------------------------------------------------------------------------------------
-# which files
-
-
-def _kind(name: str) -> str:
-    return PurePath(name.removesuffix(_COMPRESSED)).suffix
-
-
-def _number(name: str) -> tuple[int, str]:
-    """Splits are numbered; 10 comes after 9."""
-    found = re.search(r'_(\d+)\.[a-z0-9.]+$', name)
-    return (int(found[1]) if found else -1, name)
-
-
-def listed_files(folder: Path) -> list[str]:
-    """Names of the files that a folder's metadata lists; none if it has no metadata.
-
-    Raises:
-        BagError: the metadata cannot be read.
-    """
-    path = folder / METADATA
-    try:
-        with path.open('rb') as file:
-            text = file.read(_LONGEST_METADATA)
-        said = yaml.safe_load(text)['rosbag2_bagfile_information']['relative_file_paths']
-        return [PurePath(name).name for name in said]
-    except FileNotFoundError:
-        return []
-    except OSError as error:
-        raise BagError(f'{path} cannot be read: {error.strerror}') from error
-    except (yaml.YAMLError, UnicodeDecodeError, LookupError, TypeError, RecursionError) as error:
-        raise BagError(
-            f'{path} is damaged ({str(error).splitlines()[0]}). The messages do not need it: '
-            'remove it, or make a new one with `codetr bag recover`'
-        ) from error
-
-
-def _files(path: Path, on_damage: OnDamage | None) -> list[Path]:
-    try:
-        mode = path.stat().st_mode
-        if stat.S_ISREG(mode):
-            if _kind(path.name) not in _KINDS:
-                raise BagError(f'{path} is no bag: a bag is a folder, or a file of {_named()}')
-            return [path]
-        if not stat.S_ISDIR(mode):
-            raise BagError(f'{path} is neither file nor folder')
-        there = {name for name in os.listdir(path) if _kind(name) in _KINDS}
-    except OSError as error:
-        raise BagError(f'{path} cannot be read: {error.strerror}') from error
-    try:
-        listed = listed_files(path)
-        if missing := [name for name in listed if name not in there]:
-            raise BagError(
-                f'bag {path} lacks {missing[0]}, which its {METADATA} lists: put it back, or make '
-                'a whole bag of the rest with `codetr bag recover`'
-            )
-    except BagError as error:
-        if on_damage is None:
-            raise
-        on_damage(Damage(Place(path / METADATA, 0), str(error), 0))
-        listed = []
-    names = [*listed, *sorted(there - set(listed), key=_number)]
-    if not names:
-        raise BagError(f'{path} is no bag: it holds no file of {_named()}')
-    for name in names:
-        _check_file(path / name)
-    return [path / name for name in names]
-
-
-def _named() -> str:
-    return ' or '.join(_KINDS)
-
-
-def _check_file(path: Path) -> None:
-    try:
-        if not stat.S_ISREG(path.stat().st_mode):
-            raise BagError(f'{path} is no file')
-    except OSError as error:
-        raise BagError(f'{path} cannot be read: {error.strerror}') from error

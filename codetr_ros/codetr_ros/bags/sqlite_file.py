@@ -25,7 +25,11 @@ class SqliteFile:
     """
 
     def __init__(
-        self, path: Path, on_damage: OnDamage | None = None, shown: Path | None = None
+        self,
+        path: Path,
+        on_damage: OnDamage | None = None,
+        shown: Path | None = None,
+        thorough: bool = False,
     ) -> None:
         self.path = path
         self.shown = shown or path

@@ -103,6 +103,7 @@ class McapWriter:
             chunk_size=self._chunk_bytes,
             compression=CompressionType.NONE,
             enable_crcs=True,
+            enable_data_crcs=True,  # of what lies between the chunks, too
         )
         self._writer.start(profile='ros2', library='codetr_ros')
         self._channels: dict[str, int] = {}

@@ -12,6 +12,7 @@ others. No ROS is needed.
 
 commands:
   info       what is in it: runs, episodes, segments, scores, topics, files
+  verify     is it sound? every gap, duplicate, damaged chunk, missing score, by its place
 
 `codetr bag COMMAND --help` explains the options of a command.
 """
@@ -23,8 +24,15 @@ def _info(arguments: Sequence[str]) -> int:
     return bag_info.main(arguments)
 
 
+def _verify(arguments: Sequence[str]) -> int:
+    from codetr_ros.cli import bag_verify
+
+    return bag_verify.main(arguments)
+
+
 COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     'info': _info,
+    'verify': _verify,
 }
 
 

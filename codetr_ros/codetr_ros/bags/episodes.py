@@ -1,0 +1,255 @@
+"""The steps and scores of one source as a bag tells them, checked one after the other.
+
+Memory: twelve bytes for each episode, and whatever still waits for its counterpart.
+"""
+
+from array import array
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from codetr_ros.bags.findings import Findings
+from codetr_ros.intake import check_transitions
+from codetr_ros.records import (
+    CompositeReward,
+    RecordError,
+    TaskSpec,
+    Transitions,
+    TrueRewards,
+    describe,
+)
+
+_MOST_SKIPPED = 1_000_000  # episodes
+_MOST_EARLY = 10_000  # scores
+_U32 = 2**32 - 1
+Span = tuple[int, int, int]
+"""Episode, first step, length."""
+
+
+class Numbers:
+    """The sequence numbers of one source or scorer."""
+
+    def __init__(self, whose: str, findings: Findings) -> None:
+        self.whose = whose
+        self.next = 0
+        self.whole = 0  # no number below this one is missing
+        self._findings = findings
+
+    def take(self, sequence: int, place: Any) -> bool:
+        """Note a number; whether it is a new one."""
+        if sequence < self.next:
+            self._findings.add(
+                'duplicate', place, f'{self.whose}: number {sequence} comes again or out of order'
+            )
+            return False
+        if sequence > self.next:
+            missing = missing_numbers(self.next, sequence - 1)
+            self._findings.add('gap', place, f'{self.whose}: {missing} missing before {sequence}')
+        elif self.whole == sequence:
+            self.whole = sequence + 1
+        self.next = sequence + 1
+        return True
+
+
+def missing_numbers(first: int, last: int) -> str:
+    """`number 3 is` or `numbers 3 to 5 are`, to go on with 'missing'."""
+    return f'number {first} is' if first == last else f'numbers {first} to {last} are'
+
+
+class SourceChecks:
+    """What one simulator or robot did.
+
+    Args:
+        name: its name.
+        delay: steps of a segment; None where the bag does not say.
+        findings: are added to.
+    """
+
+    def __init__(self, name: str, delay: int | None, findings: Findings) -> None:
+        self.name = name
+        self.delay = delay
+        self.spec: TaskSpec | None = None
+        self.numbers = Numbers(f'transitions of {name!r}', findings)
+        self.committed = -1  # last sequence number that a commit has named
+        self.ends: dict[
+            int, int
+        ] = {}  # phase -> sequence number of its last chunk, until committed
+        self.steps = 0
+        self.scored = 0
+        self._findings = findings
+        self._lengths = array('I')  # steps of each episode so far
+        self._until = array('I')  # steps of each episode up to the end of its last scored segment
+        self._ended = array('B')
+        self._last: tuple[int, int, bytes] | None = None  # episode, next step, its observation
+        self._due: dict[Span, tuple[int, Any]] = {}  # segments without score -> sequence, place
+        self._early: list[
+            tuple[CompositeReward, Any]
+        ] = []  # scores of steps that are not here yet
+        self._chunks: dict[int, Span] = {}  # of which the true rewards have not come
+        self._true: dict[int, tuple[Span, Any]] = {}  # true rewards whose chunk has not come
+        self._has_true = False
+
+    def transitions(self, chunk: Transitions, place: Any) -> None:
+        """Check the next steps."""
+        if not self.numbers.take(chunk.sequence, place):
+            return
+        self._values(chunk, place)
+        self._follow(chunk, place)
+        if chunk.phase_end:
+            self.ends[chunk.phase] = chunk.sequence
+        self.steps += chunk.steps
+        self._lengthen(chunk, place)
+        span = chunk.episode, chunk.first_step, chunk.steps
+        if chunk.sequence in self._true:
+            self._compare(span, *self._true.pop(chunk.sequence))
+        else:
+            self._chunks[chunk.sequence] = span
+        early, self._early = self._early, []
+        for reward, where in early:
+            self.score(reward, where)
+
+    def _values(self, chunk: Transitions, place: Any) -> None:
+        if self.spec is not None:
+            try:
+                check_transitions(chunk, self.spec)
+            except RecordError as error:
+                self._findings.add('value', place, str(error))
+        else:
+            for name, values in (('observations', chunk.observations), ('actions', chunk.actions)):
+                if not np.isfinite(values).all():
+                    self._findings.add('value', place, f'{describe(chunk)}: {name} not finite')
+        if chunk.terminated and chunk.truncated:
+            self._findings.add('value', place, f'{describe(chunk)}: both terminated and truncated')
+
+    def _follow(self, chunk: Transitions, place: Any) -> None:
+        """Whether the steps go on where the last ones ended."""
+        expected: tuple[int, int] = (0, 0) if self._last is None else self._last[:2]
+        ended = chunk.terminated or chunk.truncated
+        if (chunk.episode, chunk.first_step) != expected:
+            self._findings.add(
+                'gap',
+                place,
+                f'{describe(chunk)}: episode {chunk.episode} step {chunk.first_step} where '
+                f'episode {expected[0]} step {expected[1]} is next',
+            )
+        elif chunk.first_step and self._last and chunk.observations[0].tobytes() != self._last[2]:
+            self._findings.add(
+                'value', place, f'{describe(chunk)}: begins with another observation than the one '
+                'that the steps before ended with'
+            )  # fmt: skip
+        after = chunk.first_step + chunk.steps
+        next_ = (chunk.episode + 1, 0) if ended else (chunk.episode, after)
+        self._last = (*next_, chunk.observations[-1].tobytes())
+
+    def _lengthen(self, chunk: Transitions, place: Any) -> None:
+        """Which segments ended with these steps."""
+        episode, after = chunk.episode, chunk.first_step + chunk.steps
+        if episode > len(self._lengths) + _MOST_SKIPPED:
+            return  # said as a gap; a wild number must not take memory
+        for known in (self._lengths, self._until, self._ended):
+            known.extend([0] * (episode + 1 - len(known)))
+        before = self._lengths[episode]
+        self._lengths[episode] = max(before, min(after, _U32))
+        ended = chunk.terminated or chunk.truncated
+        self._ended[episode] |= ended
+        if self.delay is None:
+            return
+        first = before // self.delay * self.delay
+        while first < after:
+            length = min(self.delay, after - first)
+            if length == self.delay or ended:
+                self._due[episode, first, length] = chunk.sequence, place
+            first += self.delay
+
+    def score(self, reward: CompositeReward, place: Any) -> None:
+        """Check that a score is that of a segment that has none yet."""
+        episode, after = reward.episode, reward.first_step + reward.length
+        if episode >= len(self._lengths) or self._lengths[episode] < after:
+            if len(self._early) < _MOST_EARLY:  # its steps come on another topic
+                self._early.append((reward, place))
+            else:
+                self._homeless(reward, place)
+            return
+        self.scored += reward.length
+        if self.delay is not None:
+            span = episode, reward.first_step, reward.length
+            if self._due.pop(span, None) is None:
+                self._findings.add(
+                    'segment',
+                    place,
+                    f'{describe(reward)} scores what is no segment of {self.delay} steps, or has '
+                    'its score already',
+                )
+        elif reward.first_step < self._until[episode]:
+            self._findings.add(
+                'segment', place, f'{describe(reward)} scores steps that have their score already'
+            )
+        self._until[episode] = max(self._until[episode], after)
+
+    def _homeless(self, reward: CompositeReward, place: Any) -> None:
+        self._findings.add(
+            'segment', place, f'{describe(reward)} scores steps that the bag does not have'
+        )
+
+    def true_rewards(self, record: TrueRewards, place: Any) -> None:
+        """Check that true rewards are those of a chunk of transitions."""
+        self._has_true = True
+        if not np.isfinite(record.rewards).all():
+            self._findings.add('value', place, f'{describe(record)}: rewards not finite')
+        span = record.episode, record.first_step, len(record.rewards)
+        if record.sequence in self._chunks:
+            self._compare(self._chunks.pop(record.sequence), span, place)
+        else:
+            self._true[record.sequence] = span, place
+
+    def _compare(self, chunk: Span, true: Span, place: Any) -> None:
+        if chunk != true:
+            self._findings.add(
+                'record',
+                place,
+                f'true rewards of {self.name!r} for episode, step, steps {true}: the transitions '
+                f'of that number have {chunk}',
+            )
+
+    def commit(self, last: int) -> None:
+        """Everything up to this sequence number belongs to the phases committed so far."""
+        self.committed = max(self.committed, last)
+        if not self._has_true:
+            for sequence in [n for n in self._chunks if n <= last]:
+                del self._chunks[sequence]
+
+    def labelled(self, span: Span) -> bool:
+        """Whether these steps are there."""
+        episode, first, length = span
+        return episode < len(self._lengths) and first + length <= self._lengths[episode]
+
+    def finish(self, commits: bool, place: Any) -> None:
+        """Say what never came. Of a bag with commits, only what they name counts."""
+        for (episode, first, length), (sequence, where) in self._due.items():
+            if not commits or sequence <= self.committed:
+                self._findings.add(
+                    'segment',
+                    where,
+                    f'{self.name!r}: the segment of episode {episode}, steps {first} to '
+                    f'{first + length - 1}, has no composite reward',
+                )
+        for reward, where in self._early:
+            self._homeless(reward, where)
+        for sequence in self._without_true(commits):
+            self._findings.add(
+                'record', place, f'transitions {sequence} of {self.name!r} have no true rewards'
+            )
+        for sequence, (_, where) in self._true.items():
+            self._findings.add(
+                'record', where, f'true rewards {sequence} of {self.name!r} have no transitions'
+            )
+
+    def _without_true(self, commits: bool) -> Iterator[int]:
+        if self._has_true:
+            yield from (n for n in self._chunks if not commits or n <= self.committed)
+
+    @property
+    def tail(self) -> int:
+        """Chunks that no commit has named."""
+        return max(0, self.numbers.next - 1 - self.committed)

@@ -1,0 +1,240 @@
+"""One run as a bag tells it, checked record by record."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load as load_tensors
+
+from codetr_ros.bags.episodes import Numbers, SourceChecks
+from codetr_ros.bags.findings import Findings
+from codetr_ros.bags.reader import Entry
+from codetr_ros.records import (
+    PROTOCOL_VERSION,
+    Commit,
+    CompositeReward,
+    EpisodeResult,
+    Policy,
+    RunSpec,
+    StepRewards,
+    TaskSpec,
+    Transitions,
+    TrueRewards,
+    describe,
+)
+
+
+class RunChecks:
+    """Everything with one run id in one namespace."""
+
+    def __init__(self, namespace: str, run_id: str, findings: Findings) -> None:
+        self.name = f'run {run_id!r} in {namespace}'
+        self.sources: dict[str, SourceChecks] = {}
+        self.phases = 0  # committed
+        self.whole = 0  # phases, from the first on, of which everything named is there
+        self._scorers: dict[str, Numbers] = {}
+        self._findings = findings
+        self._run: RunSpec | None = None
+        self._delay: int | None = None
+        self._permitted = 0
+        self._parts: tuple[int, int, int] | None = None  # phase, next part, parts
+        self._take: dict[type, Callable[[Any, Any], None]] = {
+            RunSpec: self._spec,
+            TaskSpec: self._task,
+            Transitions: lambda record, place: self._source(record).transitions(record, place),
+            TrueRewards: lambda record, place: self._source(record).true_rewards(record, place),
+            CompositeReward: self._score,
+            Commit: self._commit,
+            StepRewards: self._labels,
+            Policy: self._policy,
+            EpisodeResult: self._result,
+        }
+
+    def take(self, entry: Entry) -> None:
+        """Check the next record."""
+        check = self._take.get(entry.kind)
+        if check is not None:
+            check(entry.record, entry.place)
+
+    def _source(self, record: Any) -> SourceChecks:
+        if record.source not in self.sources:
+            self.sources[record.source] = SourceChecks(record.source, self._delay, self._findings)
+        return self.sources[record.source]
+
+    def _add(self, kind: str, place: Any, text: str) -> None:
+        self._findings.add(kind, place, f'{self.name}: {text}')
+
+    def _spec(self, record: RunSpec, place: Any) -> None:
+        if self._run is not None:
+            same = record.settings == self._run.settings
+            self._add('run', place, f'said again, with {"the same" if same else "other"} settings')
+            return
+        self._run = record
+        found = hashlib.sha256(record.settings.encode()).hexdigest()
+        if found != record.settings_hash:
+            self._add('run', place, f'settings have the hash {found}, not {record.settings_hash}')
+        if record.protocol_version != PROTOCOL_VERSION:
+            self._add(
+                'run', place, f'protocol {record.protocol_version}, this is {PROTOCOL_VERSION}'
+            )
+        try:
+            delay = json.loads(record.settings)['delay']
+            if type(delay) is not int or delay < 1:
+                raise ValueError(f'delay is {delay!r}')
+            self._delay = delay
+        except (ValueError, LookupError, TypeError) as error:
+            self._add('run', place, f'settings cannot be read: {error}')
+        for source in self.sources.values():
+            source.delay = self._delay
+
+    def _task(self, record: TaskSpec, place: Any) -> None:
+        source = self._source(record)
+        if source.spec is not None and _said(source.spec) != _said(record):
+            self._add('run', place, f'{record.source!r} announces another task than before')
+        source.spec = record
+
+    def _score(self, record: CompositeReward, place: Any) -> None:
+        numbers = self._scorers.get(record.scorer)
+        if numbers is None:
+            numbers = Numbers(f'composite rewards of {record.scorer!r}', self._findings)
+            self._scorers[record.scorer] = numbers
+        if not numbers.take(record.sequence, place):
+            return
+        if not np.isfinite(record.value):
+            self._add('value', place, f'{describe(record)} is not finite')
+        if record.length < 1:
+            self._add('value', place, f'{describe(record)} has no steps')
+            return
+        self._source(record).score(record, place)
+
+    def _commit(self, record: Commit, place: Any) -> None:
+        if record.phase != self.phases:
+            kind = 'gap' if record.phase > self.phases else 'duplicate'
+            self._add(
+                kind, place, f'commit of phase {record.phase} where phase {self.phases} is next'
+            )
+        whole = record.phase == self.phases == self.whole
+        self.phases = max(self.phases, record.phase + 1)
+        for name, last in zip(record.sources, record.transitions.tolist(), strict=True):
+            source = self.sources.get(name)
+            there = source.numbers if source else None
+            whole &= self._named('transitions', name, last, there, record.phase, place)
+            if source is None:
+                continue
+            end = source.ends.pop(record.phase, None)
+            if end != last and there and last < there.next:
+                ends = 'none' if end is None else end
+                self._add(
+                    'commit', place, f'commit of phase {record.phase} ends with transitions '
+                    f'{last} of {name!r}, the phase does with {ends}'
+                )  # fmt: skip
+            source.commit(last)
+        for name, last in zip(record.scorers, record.scores.tolist(), strict=True):
+            there = self._scorers.get(name)
+            whole &= self._named('composite rewards', name, last, there, record.phase, place)
+        self.whole += whole
+
+    def _named(
+        self, what: str, name: str, last: int, there: Numbers | None, phase: int, place: Any
+    ) -> bool:
+        """Whether everything is there up to the number that a commit names."""
+        newest = there.next - 1 if there else -1
+        if last > newest:
+            self._add(
+                'commit',
+                place,
+                f'commit of phase {phase} names {what} {last} of {name!r}, the newest before it '
+                f'is {newest if newest >= 0 else "none"}',
+            )
+        return last < 0 or (there is not None and there.whole > last)
+
+    def _labels(self, record: StepRewards, place: Any) -> None:
+        expected = (record.phase, 0)
+        if self._parts is not None:
+            phase, part, parts = self._parts
+            if part < parts:
+                expected = (phase, part)
+            elif record.phase <= phase:
+                self._add('duplicate', place, f'{describe(record)} comes again')
+        if (record.phase, record.part) != expected:
+            self._add(
+                'gap', place, f'{describe(record)} where part {expected[1]} of phase '
+                f'{expected[0]} is next'
+            )  # fmt: skip
+        self._parts = record.phase, record.part + 1, record.parts
+        if not np.isfinite(record.labels).all():
+            self._add('value', place, f'{describe(record)}: labels not finite')
+        if not record.source:
+            return
+        source = self._source(record)
+        spans = zip(
+            record.episodes.tolist(), record.first_steps.tolist(), record.lengths.tolist(),
+            strict=True,
+        )  # fmt: skip
+        if missing := [span for span in spans if not source.labelled(span)]:
+            self._add(
+                'record', place, f'{describe(record)} labels {len(missing)} segments that the bag '
+                f'does not have, the first at episode {missing[0][0]} step {missing[0][1]}'
+            )  # fmt: skip
+
+    def _policy(self, record: Policy, place: Any) -> None:
+        if not record.steps.any():
+            return  # the last one: it permits nothing
+        if record.phase != self._permitted:
+            kind = 'gap' if record.phase > self._permitted else 'duplicate'
+            self._add(
+                kind, place, f'policy of phase {record.phase} where that of {self._permitted} '
+                'is next'
+            )  # fmt: skip
+        self._permitted = max(self._permitted, record.phase + 1)
+        try:
+            tensors = load_tensors(record.weights) if record.weights else {}
+        except SafetensorError as error:
+            self._add('value', place, f'{describe(record)}: weights cannot be read: {error}')
+            return
+        for name, values in tensors.items():
+            if not np.isfinite(values).all():
+                self._add('value', place, f'{describe(record)}: weights of {name} not finite')
+
+    def _result(self, record: EpisodeResult, place: Any) -> None:
+        for name in ('true_return', 'composite_return', 'score'):
+            if not np.isfinite(getattr(record, name)):
+                self._add('value', place, f'{describe(record)}: {name} not finite')
+
+    def finish(self, place: Any) -> None:
+        """Say what never came, and what is only worth saying."""
+        for source in self.sources.values():
+            source.finish(self.phases > 0, place)
+            if self.phases and source.tail:
+                self._findings.remarks.append(
+                    f'{self.name}: the last {source.tail} transitions of {source.name!r} are of a '
+                    'phase that was not committed'
+                )
+            if self._delay is None and source.steps > source.scored:
+                self._findings.remarks.append(
+                    f'{self.name}: {source.steps - source.scored} of {source.steps} steps of '
+                    f'{source.name!r} are in no scored segment'
+                )
+            if source.spec is None and source.steps:
+                if self._run is None:
+                    self._findings.remarks.append(
+                        f'{self.name}: {source.name!r} has not announced its task'
+                    )
+                else:
+                    self._add('run', place, f'{source.name!r} has not announced its task')
+        if self._run is None and self.phases:
+            self._add(
+                'run', place, 'has commits, but no settings: the record of the run is missing'
+            )
+        if self._parts is not None and self._parts[1] < self._parts[2]:
+            phase, part, parts = self._parts
+            self._findings.remarks.append(
+                f'{self.name}: labels of phase {phase} end with part {part} of {parts}'
+            )
+
+
+def _said(record: TaskSpec) -> tuple[Any, ...]:
+    return tuple(getattr(record, name) for name in TaskSpec.__slots__)

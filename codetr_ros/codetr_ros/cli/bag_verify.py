@@ -1,0 +1,83 @@
+"""`codetr bag verify`: is a bag sound?"""
+
+import dataclasses
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+
+from codetr_ros.cli import FAILED, refuse
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Compare everything in a bag that can be compared. Exit code 0: sound, 1: damaged, 2: no bag.
+
+    Named are chunks and files that are damaged or cut off, messages that are missing or come
+    twice, numbers that are not finite, segments without their score, commits that name what is not
+    there, runs that are mixed, indexes and metadata that say what is not so.
+    """
+
+    bag: Annotated[
+        str, tyro.conf.Positional, tyro.conf.arg(metavar='BAG', help="the bag's folder or file")
+    ]
+    json: Annotated[bool, tyro.conf.arg(help='print JSON', name='json')] = False
+    limit: Annotated[
+        int, tyro.conf.arg(metavar='N', help='findings of each kind that are printed')
+    ] = 20
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Read, compare and print; the exit code."""
+    given = tyro.cli(
+        Arguments, prog='codetr bag verify', args=arguments, config=(tyro.conf.FlagCreatePairsOff,)
+    )
+    from codetr_ros.bags.errors import BagError
+    from codetr_ros.bags.verify import verify
+
+    try:
+        verdict = verify(given.bag)
+    except BagError as error:
+        return refuse(str(error))
+    if given.json:
+        print(json.dumps(verdict.report(), indent=2))
+    else:
+        show(verdict.report(), given.limit, Console(soft_wrap=True))
+    return 0 if verdict.sound else FAILED
+
+
+def show(report: Mapping[str, Any], limit: int, console: Console) -> None:
+    """Print what `verify` found."""
+    shown: Counter[str] = Counter()
+    for finding in report['findings']:
+        shown[finding['kind']] += 1
+        if shown[finding['kind']] <= limit:
+            text = f'{finding["kind"]}: {finding["place"]}: {finding["text"]}'
+            console.print(escape(text), highlight=False)
+    for kind, count in report['found'].items():
+        if count > limit:
+            console.print(f'{kind}: {count - limit} more', highlight=False)
+    for remark in report['remarks']:
+        console.print(f'note: {escape(remark)}', highlight=False)
+    for run in report['runs']:
+        committed, whole = run['phases_committed'], run['phases_whole']
+        if committed:
+            text = f'run {run["run_id"]!r} in {run["namespace"]}: {committed} phases committed'
+            last = f', whole up to phase {whole - 1}' if whole else ', none of them whole'
+            console.print(text + (', all whole' if whole == committed else last), highlight=False)
+    total = sum(report['found'].values())
+    if total:
+        kinds = ', '.join(f'{count} {kind}' for kind, count in report['found'].items())
+        console.print(
+            f'{report["bag"]}: damaged: {total} findings ({kinds}) in {report["messages"]} '
+            f'messages. `codetr bag recover {report["bag"]} --out NEW` makes a whole bag of what '
+            'can be read',
+            style='red',
+            highlight=False,
+        )
+    else:
+        console.print(f'{report["bag"]}: sound, {report["messages"]} messages', style='green')
