@@ -41,17 +41,39 @@ class Run:
     ] = False
 
 
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """Make a report of one or several benchmarks: tables, pictures, what has failed.
+
+    Writes index.html, table.md, table.csv, cells.csv and pictures.
+    """
+
+    folders: Annotated[
+        tuple[str, ...],
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar='DIR [DIR ...]', help="the benchmarks' folders"),
+    ]
+    out: Annotated[
+        str | None, tyro.conf.arg(metavar='DIR', help='where it goes; by default DIR/report')
+    ] = None
+
+
 def main(arguments: Sequence[str]) -> int:
-    """Run the benchmark's part that the command line names; the exit code."""
-    return tyro.extras.subcommand_cli_from_dict(
-        {'run': _run},
+    """Do what the command line says; the exit code."""
+    kinds = (
+        Annotated[Run, tyro.conf.subcommand('run')]
+        | Annotated[Report, tyro.conf.subcommand('report')]
+    )
+    given: Run | Report = tyro.cli(
+        kinds,
         prog='codetr benchmark',
         description='Many runs under one protocol, and the table that they make.',
         args=arguments,
     )
+    return _run(given) if isinstance(given, Run) else _report(given)
 
 
-def _run(given: Annotated[Run, tyro.conf.OmitArgPrefixes]) -> int:
+def _run(given: Run) -> int:
     from codetr_ros.benchmark import run, spec
 
     if given.workers < 1:
@@ -81,3 +103,20 @@ def _run(given: Annotated[Run, tyro.conf.OmitArgPrefixes]) -> int:
             print(f'  {cell}: {why}')
         print(f'their logs: {out}/cells/<cell>.log; --retry-failed runs them again')
     return FAILED if failed else 0
+
+
+def _report(given: Report) -> int:
+    from codetr_ros.benchmark import report, spec
+    from codetr_ros.tasks import TaskError
+
+    if not given.folders:
+        return refuse('benchmark report: give the folder of a benchmark')
+    try:
+        folder, said = report.write(
+            [Path(name) for name in given.folders], Path(given.out) if given.out else None
+        )
+    except (spec.BenchmarkError, TaskError) as error:
+        return refuse(str(error))
+    print(said)
+    print(f'report: {folder / "index.html"}')
+    return 0

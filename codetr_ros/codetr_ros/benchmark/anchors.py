@@ -1,0 +1,116 @@
+"""Trivial anchors: what a random policy scores, and one that does nothing at all.
+
+On Ant, standing still beats several published baselines: no score can be read without it.
+"""
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codetr_ros import tasks
+from codetr_ros.benchmark.folder import read_json
+from codetr_ros.benchmark.results import Result
+from codetr_ros.composite import composite, perfect_score
+from codetr_ros.environments import Environment
+from codetr_ros.records import F32, F64
+from codetr_ros.rollout import uniform_actions
+from codetr_ros.run_folder import atomic_write
+from codetr_ros.seeding import generator
+
+FILE = 'anchors.json'
+SEED = 0
+"""Of the start states and the random actions: those of the evaluations of seed 0."""
+_NUMBERS = ('score_mean', 'score_std', 'true_return_mean', 'true_return_std', 'length_mean')
+
+Anchors = dict[tuple[str, str, int], dict[str, dict[str, float]]]
+"""By task, composite reward and delay: 'random' and 'zero', each with its numbers."""
+
+
+def anchors(results: Sequence[Result], path: Path) -> Anchors:
+    """The anchors of every task, composite reward and delay; simulated once, kept in `path`.
+
+    Raises:
+        TaskError: a task cannot be made.
+    """
+    kept = read_json(path) or {}
+    rewards: dict[tuple[str, int], dict[str, list[F64]]] = {}
+    found: Anchors = {}
+    for result in results:
+        key = (result.task, result.composite, result.delay)
+        if key in found:
+            continue
+        name = f'{result.task} {result.composite} {result.delay}'
+        parameters = {
+            'beta': result.settings['beta'],
+            'r_max': result.settings['r_max'] or tasks.find(result.task).r_max,
+            'episodes': result.settings['evaluate_episodes'],
+            'seed': SEED,
+        }
+        row = kept.get(name)
+        if row is None or row['parameters'] != parameters:
+            which = (result.task, parameters['episodes'])
+            if which not in rewards:
+                rewards[which] = simulate(*which)
+            horizon = tasks.find(result.task).horizon
+            row = kept[name] = {'parameters': parameters} | {
+                policy: _numbers(episodes, result.composite, result.delay, horizon, parameters)
+                for policy, episodes in rewards[which].items()
+            }
+        found[key] = {policy: row[policy] for policy in ('random', 'zero')}
+    if rewards:
+        atomic_write(path, json.dumps(kept, indent=1) + '\n')
+    return found
+
+
+def simulate(task: str, episodes: int) -> dict[str, list[F64]]:
+    """True rewards of each episode of the random policy and of the zero action."""
+    environment = tasks.make(task)
+    shape = environment.horizon, environment.action_size
+    try:
+        return {
+            'random': _episodes(
+                environment,
+                episodes,
+                lambda i: uniform_actions(generator(SEED, 'evaluate', 'random', i), *shape),
+            ),
+            'zero': _episodes(environment, episodes, lambda i: np.zeros(shape, np.float32)),
+        }
+    finally:
+        environment.close()
+
+
+def _episodes(environment: Environment, episodes: int, actions: Callable[[int], F32]) -> list[F64]:
+    found = []
+    for number in range(episodes):
+        environment.reset(int(generator(SEED, 'evaluate', number).integers(2**31)))
+        rewards = []
+        for action in actions(number):
+            _, reward, terminated = environment.step(action)
+            rewards.append(reward)
+            if terminated:
+                break
+        found.append(np.array(rewards, np.float64))
+    return found
+
+
+def _numbers(
+    episodes: Sequence[F64], name: str, delay: int, horizon: int, parameters: dict[str, Any]
+) -> dict[str, float]:
+    """As an evaluation has them: segments from the episode's start, a shorter last one too."""
+    beta = parameters['beta']
+    perfect = perfect_score(name, beta, delay, horizon, parameters['r_max'])
+    scores = [
+        sum(
+            composite(name, rewards[i : i + delay], beta, delay)
+            for i in range(0, len(rewards), delay)
+        )
+        / perfect
+        for rewards in episodes
+    ]
+    returns = [float(rewards.sum()) for rewards in episodes]
+    values = np.mean(scores), np.std(scores), np.mean(returns), np.std(returns)
+    lengths = np.mean([len(rewards) for rewards in episodes])
+    return dict(zip(_NUMBERS, map(float, (*values, lengths)), strict=True))

@@ -1,0 +1,151 @@
+"""The report of a benchmark: one page with tables and pictures, in HTML and Markdown, and CSV."""
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from codetr_ros import tasks
+from codetr_ros.benchmark import anchors as trivial
+from codetr_ros.benchmark import curves, scores, sections, table
+from codetr_ros.benchmark.document import Block, Heading, markdown, page
+from codetr_ros.benchmark.folder import Folder
+from codetr_ros.benchmark.results import Result, read
+from codetr_ros.run_folder import atomic_write
+
+REPORT = 'report'
+
+
+def write(paths: Sequence[Path], out: Path | None = None) -> tuple[Path, str]:
+    """Report on benchmarks.
+
+    Args:
+        paths: their folders.
+        out: where the report goes; `report` in the first folder where not given.
+
+    Returns:
+        The report's folder, and its tables over delays as Markdown.
+
+    Raises:
+        BenchmarkError: a folder is no benchmark's, or they cannot be compared.
+        TaskError: a task of which the trivial anchors are to be simulated cannot be made.
+    """
+    results = read(paths)
+    first = Folder(paths[0])
+    folder = out or first.path / REPORT
+    folder.mkdir(parents=True, exist_ok=True)
+    anchors = trivial.anchors(results, first.path / trivial.FILE)
+    pictures = dict(_pictures(results, anchors))
+    for name, picture in pictures.items():
+        atomic_write(folder / name, picture)
+    together, alone = table.rows(results)
+    summary: list[Block] = scores.table_2(results, together, anchors)
+    blocks: list[Block] = [
+        Heading(sections.title(results), 1),
+        *sections.protocol(results),
+        *summary,
+        *scores.each_delay(alone),
+        *scores.returns(together, alone),
+        *scores.interquartile(table.aggregate(together), together),
+        *scores.anchors(anchors),
+        *sections.recovery(results),
+        *sections.pictures(pictures),
+        *sections.unfinished(results),
+        *sections.the_paper(_r_max(results)),
+        *sections.settings(results),
+        *sections.sessions(paths),
+    ]
+    atomic_write(folder / 'table.md', markdown(blocks))
+    atomic_write(folder / 'index.html', page(blocks))
+    atomic_write(folder / 'table.csv', table_csv([*together, *alone]))
+    atomic_write(folder / 'cells.csv', cells_csv(results))
+    return folder, markdown(summary)
+
+
+def _r_max(results: Sequence[Result]) -> dict[str, float]:
+    return {r.task: r.settings['r_max'] or tasks.find(r.task).r_max for r in results}
+
+
+def _pictures(results: Sequence[Result], anchors: trivial.Anchors) -> Iterator[tuple[str, bytes]]:
+    """Each picture by its file name."""
+    order = table.methods(results)
+    for key, numbers in anchors.items():
+        some = [r for r in results if (r.task, r.composite, r.delay) == key]
+        name = some[0].cell.split(f'_{some[0].method}_seed')[0]
+        seeds = len({result.seed for result in some if result.summary})
+        task, composite, delay = key
+        title = f'{task}: {composite} of {delay} steps; mean and range of up to {seeds} seeds'
+        yield f'learning_{name}.png', curves.learning_curves(some, order, numbers, title)
+        picture = curves.recovery_curves(some, order, f'Reward recovery. {title}')
+        if picture is not None:
+            yield f'recovery_{name}.png', picture
+
+
+def table_csv(rows: Sequence[table.Row]) -> str:
+    """A line for each method in each row, over several delays and each alone."""
+    lines: list[dict[str, Any]] = []
+    for row in rows:
+        for entry in row.entries:
+            low, high = entry.interval or (None, None)
+            lines.append(
+                {
+                    'task': row.task,
+                    'composite': row.composite,
+                    'delays': ' '.join(map(str, row.delays)),
+                    'method': entry.method,
+                    'score_mean': entry.mean,
+                    'score_spread': entry.spread,
+                    'score_iqm': entry.iqm,
+                    'score_iqm_low': low,
+                    'score_iqm_high': high,
+                    'return_mean': entry.return_mean,
+                    'return_spread': entry.return_spread,
+                    'best': int(entry.best),
+                    'bold': int(entry.bold),
+                    'p': entry.p,
+                    'pairs': entry.pairs,
+                    'cells': len(entry.scores),
+                    'cells_planned': entry.planned,
+                    'cells_failed': entry.failed,
+                }
+            )
+    return _csv(lines)
+
+
+def cells_csv(results: Sequence[Result]) -> str:
+    """A line for each cell, whatever has become of it."""
+    return _csv(
+        [
+            {
+                'cell': r.cell,
+                'task': r.task,
+                'composite': r.composite,
+                'delay': r.delay,
+                'method': r.method,
+                'seed': r.seed,
+                'state': r.state,
+                'score': r.score,
+                'true_return': r.true_return,
+                'within_pearson': _last(r, 'within'),
+                'wall_s': r.summary.get('wall_s'),
+                'commit': r.commit,
+                'error': r.error,
+            }
+            for r in results
+        ]
+    )
+
+
+def _last(result: Result, of: str) -> float | None:
+    rows = result.summary.get('reward_recovery') or ()
+    return rows[-1][of] if rows else None
+
+
+def _csv(lines: Sequence[dict[str, Any]]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(lines[0]), lineterminator='\n')
+    writer.writeheader()
+    for line in lines:
+        writer.writerow({k: repr(v) if isinstance(v, float) else v for k, v in line.items()})
+    return text.getvalue()

@@ -1,0 +1,215 @@
+"""The parts of a benchmark's report that hold scores and returns."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from codetr_ros.benchmark import paper
+from codetr_ros.benchmark.anchors import Anchors
+from codetr_ros.benchmark.document import (
+    Block,
+    Bold,
+    Heading,
+    Items,
+    Paragraph,
+    Table,
+)
+from codetr_ros.benchmark.results import Result
+from codetr_ros.benchmark.statistics import CONFIDENCE, REPLICATES, SIGNIFICANCE
+from codetr_ros.benchmark.table import ORACLES, TABLE_DELAYS, Aggregate, Entry, Row, methods
+
+NONE = '–'
+"""Where there is nothing to show."""
+
+
+def _number(value: float | None, digits: int) -> str:
+    return NONE if value is None else f'{value:.{digits}f}'
+
+
+def _score(entry: Entry, mean: float | None, spread: float | None, digits: int) -> str:
+    done = len(entry.scores)
+    failed = f', {entry.failed} failed' if entry.failed else ''
+    lacking = f' [{done} of {entry.planned}{failed}]' if done < entry.planned else ''
+    if mean is None:
+        return f'no result{lacking}'
+    around = f' ({spread:.{digits}f})' if spread is not None else ''
+    return f'{mean:.{digits}f}{around}{lacking}'
+
+
+def _line(row: Row, order: Sequence[str], first: Sequence[str]) -> list[str | Bold]:
+    cells: list[str | Bold] = list(first)
+    by_method = {entry.method: entry for entry in row.entries}
+    for method in order:
+        entry = by_method.get(method)
+        if entry is None:
+            cells.append(NONE)
+            continue
+        text = _score(entry, entry.mean, entry.spread, 4)
+        cells.append(Bold(text) if entry.bold else text)
+    return cells
+
+
+def _delays(row: Row) -> str:
+    return ', '.join(map(str, row.delays))
+
+
+def table_2(results: Sequence[Result], together: Sequence[Row], anchors: Anchors) -> list[Block]:
+    """The layout of the supplement's Table 2, a table for each task."""
+    low, high = TABLE_DELAYS
+    blocks: list[Block] = [Heading(f'Scores, mean over delays {low} to {high}')]
+    for task in dict.fromkeys(result.task for result in results):
+        rows = [row for row in together if row.task == task]
+        if not rows:
+            blocks.append(Paragraph(f'{task}: no delay from {low} to {high} was planned.'))
+            continue
+        order = methods([result for result in results if result.task == task])
+        lines: list[list[str | Bold]] = []
+        for row in rows:
+            line = _line(row, order, [row.composite, _delays(row)])
+            lines.append([*line, *(_anchor(row, anchors, which) for which in _ANCHORS)])
+            if task in paper.TASKS and row.composite in paper.TABLE_2:
+                lines.append(_paper_line(row.composite, order))
+        head = ['composite', 'delays', *order, *_ANCHORS.values()]
+        blocks += [Heading(task, 3), Table(head, lines)]
+    return [*blocks, *_reading()]
+
+
+def _paper_line(composite: str, order: Sequence[str]) -> list[str | Bold]:
+    cells: list[str | Bold] = ["... in the paper's Table 2", '25 to 200']
+    for method in order:
+        number = paper.TABLE_2[composite].get(method)
+        cells.append(f'{number[0]:.4f} ({number[1]:.4f})' if number else NONE)
+    return [*cells, NONE, NONE]
+
+
+_ANCHORS = {'random': 'random', 'zero': 'standing still'}
+
+
+def _anchor(row: Row, anchors: Anchors, which: str) -> str:
+    scores = [anchors[row.task, row.composite, d][which]['score_mean'] for d in row.delays]
+    return f'{np.mean(scores):.4f}'
+
+
+def _reading() -> list[Block]:
+    low, high = TABLE_DELAYS
+    return [
+        Items(
+            [
+                f'A cell is the mean over the delays from {low} to {high} that were planned and '
+                'over seeds. That a cell of the paper is such a mean is inferred.',
+                'In brackets: sample standard deviation over seeds of the mean over delays; '
+                'nothing where there is one seed.',
+                f'Bold: the highest mean, and all that a paired t-test at {SIGNIFICANCE:.0%} over '
+                'pairs of seed and delay does not tell from it. Few pairs tell little apart. With '
+                'fewer than two pairs no test is possible: then only the highest mean is bold.',
+                f'{", ".join(ORACLES)} sees the rewards that no other method may see: it is '
+                'neither best nor compared.',
+                '[n of m, k failed]: only n of m cells have finished; the mean is over those, '
+                'which need not be the same delays and seeds as elsewhere.',
+                'random, standing still: the trivial anchors, mean over the same delays.',
+            ]
+        )
+    ]
+
+
+def each_delay(alone: Sequence[Row]) -> list[Block]:
+    """Scores of each delay alone."""
+    blocks: list[Block] = [Heading('Scores, each delay alone')]
+    for task in dict.fromkeys(row.task for row in alone):
+        rows = [row for row in alone if row.task == task]
+        order = list(dict.fromkeys(e.method for row in rows for e in row.entries))
+        lines = [_line(row, order, [row.composite, _delays(row)]) for row in rows]
+        blocks += [Heading(task, 3), Table(['composite', 'delay', *order], lines)]
+    return blocks
+
+
+def returns(together: Sequence[Row], alone: Sequence[Row]) -> list[Block]:
+    """True returns: what an episode earned in the task's own rewards."""
+    blocks: list[Block] = [
+        Heading('True returns'),
+        Paragraph(
+            "The task's own rewards, summed over an episode: mean, and in brackets the spread "
+            'over seeds as above.'
+        ),
+    ]
+    several = [row for row in together if len(row.delays) > 1]
+    for task in dict.fromkeys(row.task for row in alone):
+        rows = [row for row in (*several, *alone) if row.task == task]
+        order = list(dict.fromkeys(e.method for row in rows for e in row.entries))
+        lines: list[list[str | Bold]] = []
+        for row in rows:
+            by_method = {entry.method: entry for entry in row.entries}
+            line: list[str | Bold] = [row.composite, _delays(row)]
+            for method in order:
+                e = by_method.get(method)
+                line.append(_score(e, e.return_mean, e.return_spread, 1) if e else NONE)
+            lines.append(line)
+        blocks += [Heading(task, 3), Table(['composite', 'delays', *order], lines)]
+    return blocks
+
+
+def interquartile(aggregates: Sequence[Aggregate], together: Sequence[Row]) -> list[Block]:
+    """Interquartile means with their intervals."""
+    lines: list[list[str | Bold]] = []
+    for row in together:
+        for entry in row.entries:
+            lines.append(
+                [
+                    row.task,
+                    row.composite,
+                    entry.method,
+                    _number(entry.iqm, 4),
+                    _interval(entry.interval),
+                    str(len(entry.scores)),
+                ]
+            )
+    for each in aggregates:
+        if len(each.composites) > 1:
+            lines.append(
+                [
+                    each.task,
+                    'all',
+                    each.method,
+                    f'{each.iqm:.4f}',
+                    _interval(each.interval),
+                    str(each.cells),
+                ]
+            )
+    if not lines:
+        return []
+    return [
+        Heading('Interquartile means of scores'),
+        Paragraph(
+            f'Mean of the middle half of the scores, with {CONFIDENCE:.0%} percentile intervals '
+            f'of a stratified bootstrap ({REPLICATES} draws; strata are composite reward and '
+            'delay, seeds are drawn within). With three seeds such an interval is rough.'
+        ),
+        Table(['task', 'composite', 'method', 'IQM', 'interval', 'cells'], lines),
+    ]
+
+
+def _interval(interval: tuple[float, float] | None) -> str:
+    return NONE if interval is None else f'{interval[0]:.4f} to {interval[1]:.4f}'
+
+
+def anchors(found: Anchors) -> list[Block]:
+    """Trivial policies."""
+    lines: list[list[str | Bold]] = [
+        [
+            task,
+            composite,
+            str(delay),
+            *(f'{by[policy]["score_mean"]:.4f}' for policy in ('random', 'zero')),
+            *(f'{by[policy]["true_return_mean"]:.1f}' for policy in ('random', 'zero')),
+        ]
+        for (task, composite, delay), by in found.items()
+    ]
+    head = ['task', 'composite', 'delay', 'random: score', 'standing still: score']
+    return [
+        Heading('Trivial anchors'),
+        Paragraph(
+            'A uniformly random policy, and one that stands still (action 0). What does not beat '
+            'both has learnt nothing that counts.'
+        ),
+        Table([*head, 'random: return', 'standing still: return'], lines),
+    ]
