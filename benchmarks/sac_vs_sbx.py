@@ -1,6 +1,7 @@
 """Is our SAC as good as another? True-reward SAC on HalfCheetah-v5: ours against SBX.
 
     .venv/bin/python benchmarks/sac_vs_sbx.py ours --seed 0 1 2
+    .venv/bin/python benchmarks/sac_vs_sbx.py ours_lecun --seed 0 1 2
 
     python3 -m venv /tmp/sbx-venv
     /tmp/sbx-venv/bin/pip install -r benchmarks/requirements-sbx.txt
@@ -27,15 +28,15 @@ What differs, on purpose, because it is what SBX does:
     same sign; Adam takes nearly the same steps)
   - step 10 000 itself acts under the initial policy, not at random: `learning_starts` is 9999,
     for otherwise the first burst would come at step 11 000
+
+Which of them makes the difference? `ours_lecun` is ours with flax's initial weights and nothing
+else changed.
 """
 
 import argparse
 import csv
 import json
 import os
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -47,7 +48,7 @@ STEPS, WARMUP, PHASE = 50_000, 10_000, 1000
 EVALUATE_EVERY, EPISODES = 5000, 10
 ACTION_SIZE = 6
 RESULTS = Path(__file__).parent / 'results' / 'sac_vs_sbx'
-NAMES = {'ours': 'codetr_ros', 'sbx': 'SBX'}
+NAMES = {'ours': 'codetr_ros', 'ours_lecun': 'codetr_ros, LeCun weights', 'sbx': 'SBX'}
 
 
 def run_sbx(seed: int, steps: int = STEPS, warmup: int = WARMUP) -> dict[str, Any]:
@@ -107,12 +108,21 @@ def run_sbx(seed: int, steps: int = STEPS, warmup: int = WARMUP) -> dict[str, An
     }
 
 
-def run_ours(seed: int, steps: int = STEPS, warmup: int = WARMUP) -> dict[str, Any]:
-    """One in-process run of ours, by the command that users have."""
-    settings = {
+def run_ours(
+    seed: int, lecun: bool = False, steps: int = STEPS, warmup: int = WARMUP
+) -> dict[str, Any]:
+    """One in-process run of ours, with its own initial weights or with flax's."""
+    from codetr_ros import config, in_process
+    from codetr_ros.learners import from_labels
+    from codetr_ros.summary import Summary
+
+    if lecun:
+        from_labels.FlatSAC = _with_lecun_weights(from_labels.FlatSAC)
+    given = {
         'task': TASK,
         'method': 'true',
         'steps': steps,
+        'seed': seed,
         'phase_steps': PHASE,
         'warmup_steps': warmup,
         'memory_steps': steps,
@@ -122,26 +132,42 @@ def run_ours(seed: int, steps: int = STEPS, warmup: int = WARMUP) -> dict[str, A
         'reward_unit': 'raw',
         'threads': 1,
     }  # the rest: the defaults, which are jaxrl's
-    with tempfile.TemporaryDirectory() as folder:
-        config, out = Path(folder, 'config.yaml'), Path(folder, 'run')
-        config.write_text(json.dumps(settings))  # JSON is YAML
-        command = [
-            sys.executable,
-            '-m',
-            'codetr_ros.cli',
-            'train',
-            '--in-process',
-            '--config',
-            str(config),
-        ]
-        subprocess.run([*command, '--seed', str(seed), '--out', str(out)], check=True)
-        summary = json.loads((out / 'summary.json').read_text())
+    settings = config.parse(given, 'benchmark')
+    started = time.monotonic()
+    summary = Summary(settings, 'benchmark', True)
+    reports = in_process.run(settings, 'benchmark', observe=summary.receive)
+    evaluations = summary.build(reports, None, False, None)['evaluations']
     packages = ('torch', 'gymnasium', 'mujoco')
     return {
-        'evaluations': [e for e in summary['evaluations'] if e['step'] >= warmup],
-        'wall_s': summary['wall_s'],
+        'evaluations': [e for e in evaluations if e['step'] >= warmup],
+        'wall_s': time.monotonic() - started,
         'versions': {name: version(name) for name in packages},
     }
+
+
+def _with_lecun_weights(sac: type) -> type:
+    """Our SAC with flax's default initial weights: normal of variance 1/inputs, cut off at two
+    standard deviations.
+    """
+    import torch
+
+    from codetr_ros.learners.network import linear_layers
+
+    def draw(weight: Any, inputs: int) -> None:
+        std = inputs**-0.5 / 0.87962566103423978  # what the cut takes off the deviation
+        torch.nn.init.trunc_normal_(weight, 0.0, std, -2 * std, 2 * std)
+
+    class LecunSAC(sac):
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments)
+            for layer in linear_layers(self.actor):
+                draw(layer.weight, layer.in_features)
+            for weight in self.critic_values[::2]:  # (2, in, out); biases stand between them
+                for one in weight:
+                    draw(one, weight.shape[1])
+            torch._foreach_copy_(self.target, self.critic_values)
+
+    return LecunSAC
 
 
 def run(implementation: str, seeds: Sequence[int]) -> None:
@@ -152,7 +178,11 @@ def run(implementation: str, seeds: Sequence[int]) -> None:
         if path.exists():
             print(f'{path} is there already')
             continue
-        result = run_sbx(seed) if implementation == 'sbx' else run_ours(seed)
+        result = (
+            run_sbx(seed)
+            if implementation == 'sbx'
+            else run_ours(seed, lecun=implementation == 'ours_lecun')
+        )
         result = {
             'implementation': implementation,
             'seed': seed,
