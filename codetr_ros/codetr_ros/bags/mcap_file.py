@@ -34,6 +34,7 @@ from codetr_ros.bags.mcap_layout import (
     full_type_name,
     parse_record,
     resume_at,
+    summary_records,
 )
 
 OnDamage = Callable[[Damage], None]
@@ -103,6 +104,7 @@ class McapFile:
         self._said: dict[int, Any] = {}
         self._ids: Counter[int] = Counter()
         self._indexed: Counter[int] | None = None  # messages of the last chunk, by channel
+        self._faulty = self._borrowed = False
 
     def channels(self) -> list[Channel]:
         """The topics that have been met so far."""
@@ -128,6 +130,7 @@ class McapFile:
 
     def _say(self, offset: int, text: str, lost: int, harmless: bool = False) -> None:
         damage = Damage(Place(self.shown, offset), text, lost, harmless)
+        self._faulty |= not harmless
         if self._on_damage is not None:
             self._on_damage(damage)
         elif not harmless:
@@ -159,8 +162,22 @@ class McapFile:
                 self._say(at, str(fault), after - at, harmless=ended)
                 self._indexed = None
                 at = after
+            if self._faulty and not self._borrowed:
+                self._borrow(file, size)
             file.seek(at)
         self._say(size, 'the file ends here, without its index: its writer was killed', 0)
+
+    def _borrow(self, file: BinaryIO, size: int) -> None:
+        """Take topics from the summary, which repeats them: the chunk that described them may be
+        the one that is damaged.
+        """
+        self._borrowed = True
+        for record in summary_records(file, size):
+            if isinstance(record, mcap_records.Schema):
+                self._schemas.setdefault(record.id, record)
+            elif isinstance(record, mcap_records.Channel) and record.id not in self._said:
+                self._said[record.id] = record
+                self._channels[record.id] = self._channel(record)
 
     def _next(self, file: BinaryIO, at: int, size: int, ended: bool) -> tuple[int, bytes]:
         head = file.read(HEAD.size)

@@ -3,6 +3,7 @@
 import mmap
 import re
 import struct
+import zlib
 from io import BytesIO
 from typing import Any, BinaryIO
 
@@ -146,3 +147,30 @@ def next_chunk(file: BinaryIO, at: int, size: int) -> int:
                 return found
             at = found + 1
     return size
+
+
+def summary_records(file: BinaryIO, size: int) -> list[Any]:
+    """The summary's schemas and channels; none unless its checksum says that it is as written."""
+    tail = HEAD.size + 20 + len(MAGIC)  # footer and magic
+    if size < tail:
+        return []
+    file.seek(size - tail)
+    footer = file.read(tail)
+    opcode, length, start, _, crc = struct.unpack_from('<BQQQI', footer)
+    end = size - tail
+    if (opcode, length) != (Opcode.FOOTER, 20) or not 0 < start < end:
+        return []
+    if end - start > LARGEST_RECORD:
+        return []
+    file.seek(start)
+    summary = file.read(end - start)
+    if not crc or zlib.crc32(footer[: HEAD.size + 16], zlib.crc32(summary)) != crc:
+        return []
+    found, at = [], 0
+    while at + HEAD.size <= len(summary):
+        opcode, length = HEAD.unpack_from(summary, at)
+        content = summary[at + HEAD.size : at + HEAD.size + length]
+        at += HEAD.size + length
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            found.append(parse_record(SUMMARY[Opcode(opcode)], content))
+    return found

@@ -5,17 +5,33 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, Protocol
 
 import yaml
-
-from codetr_ros.bags.topics import BagTopic, type_hash
 
 METADATA = 'metadata.yaml'
 VERSION = 9
 """Of the file's layout, as rosbag2 of Jazzy writes it."""
 LONGEST = 16 << 20
 """Bytes of the file that are read."""
+
+
+class Topic(Protocol):
+    """A topic as it is to be described."""
+
+    @property
+    def name(self) -> str:
+        """Its full name."""
+
+    @property
+    def type(self) -> str:
+        """Such as `sensor_msgs/msg/JointState`."""
+
+    def qos(self) -> list[dict[str, Any]]:
+        """The QoS it was offered with."""
+
+    def digest(self) -> str:
+        """REP-2016 hash of its type; empty where it is not known."""
 
 
 @dataclass
@@ -39,7 +55,7 @@ class BagFile:
         self.counts[topic] += 1
 
 
-def render(files: Sequence[BagFile], topics: Iterable[BagTopic]) -> str:
+def render(files: Sequence[BagFile], topics: Iterable[Topic]) -> str:
     """The text of `metadata.yaml`.
 
     Args:
@@ -63,7 +79,7 @@ def render(files: Sequence[BagFile], topics: Iterable[BagTopic]) -> str:
                     'type': topic.type,
                     'serialization_format': 'cdr',
                     'offered_qos_profiles': topic.qos(),
-                    'type_description_hash': type_hash(topic.type),
+                    'type_description_hash': topic.digest(),
                 },
                 'message_count': counts[topic.name],
             }

@@ -41,6 +41,10 @@ class BagTopic:
             }
         ]
 
+    def digest(self) -> str:
+        """REP-2016 hash of its type."""
+        return type_hash(self.type)
+
 
 @cache
 def _share_folders() -> tuple[Path, ...]:

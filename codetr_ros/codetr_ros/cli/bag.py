@@ -13,6 +13,7 @@ others. No ROS is needed.
 commands:
   info       what is in it: runs, episodes, segments, scores, topics, files
   verify     is it sound? every gap, duplicate, damaged chunk, missing score, by its place
+  recover    make a whole bag of what can be read of a damaged or unfinished one
 
 `codetr bag COMMAND --help` explains the options of a command.
 """
@@ -30,9 +31,16 @@ def _verify(arguments: Sequence[str]) -> int:
     return bag_verify.main(arguments)
 
 
+def _recover(arguments: Sequence[str]) -> int:
+    from codetr_ros.cli import bag_recover
+
+    return bag_recover.main(arguments)
+
+
 COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     'info': _info,
     'verify': _verify,
+    'recover': _recover,
 }
 
 

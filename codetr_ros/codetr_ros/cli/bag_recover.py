@@ -1,0 +1,85 @@
+"""`codetr bag recover`: make a whole bag of what can be read."""
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+
+from codetr_ros.cli import FAILED, refuse
+
+SHOWN = 20
+"""Losses that are printed; `--json` has more."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Make a whole bag (index, metadata) of what can be read of a damaged or unfinished one.
+
+    Every message that can be read is kept byte for byte, in order; what was lost is said. The old
+    bag is not touched. Exit code 0: the new bag is sound, 1: something within it is missing, 2:
+    nothing could be done.
+    """
+
+    bag: Annotated[
+        str, tyro.conf.Positional, tyro.conf.arg(metavar='BAG', help="the bag's folder or file")
+    ]
+    out: Annotated[str, tyro.conf.arg(metavar='NEW', help='folder of the new bag')]
+    json: Annotated[bool, tyro.conf.arg(help='print JSON', name='json')] = False
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Recover and print; the exit code."""
+    given = tyro.cli(
+        Arguments,
+        prog='codetr bag recover',
+        args=arguments,
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )
+    from codetr_ros.bags.errors import BagError
+    from codetr_ros.bags.recover import recover
+
+    try:
+        found = recover(given.bag, given.out)
+    except BagError as error:
+        return refuse(str(error))
+    if given.json:
+        print(json.dumps(found.report(), indent=2))
+    else:
+        show(found.report(), Console(soft_wrap=True))
+    return 0 if found.verdict and found.verdict.sound else FAILED
+
+
+def show(report: Mapping[str, Any], console: Console) -> None:
+    """Print what became of the bag."""
+
+    def say(text: str) -> None:
+        console.print(escape(text), highlight=False)
+
+    for loss in report['losses'][:SHOWN]:
+        lost = f' ({loss["bytes"]} bytes lost)' if loss['bytes'] else ''
+        say(f'{loss["place"]}: {loss["text"]}{lost}')
+    if report['faults'] > SHOWN:
+        say(f'{report["faults"] - SHOWN} more')
+    verdict = report['verdict']
+    for finding in verdict['findings'][:SHOWN]:
+        say(f'in the new bag: {finding["kind"]}: {finding["text"]}')
+    if len(verdict['findings']) > SHOWN:
+        say(f'`codetr bag verify {report["new"]}` names {len(verdict["findings"]) - SHOWN} more')
+    for remark in verdict['remarks']:
+        say(f'note: {remark}')
+    for run in verdict['runs']:
+        if run['phases_committed']:
+            whole = run['phases_whole']
+            upto = f'whole up to phase {whole - 1}' if whole else 'no phase is whole'
+            say(
+                f'run {run["run_id"]!r} in {run["namespace"]}: {upto}, '
+                f'{run["phases_committed"]} phases were committed'
+            )
+    say(
+        f'{report["new"]}: {report["messages"]} messages, {report["bytes"]} bytes kept; '
+        f'{report["bytes_lost"]} bytes of {report["old"]} could not be read'
+    )

@@ -1,0 +1,189 @@
+import json
+import os
+import subprocess
+import sys
+import textwrap
+
+import pytest
+from bags.making import WRITERS, a_run, by_mcap, ours
+from mcap.writer import CompressionType
+from rosbags.highlevel import AnyReader
+
+from codetr_ros.bags.errors import BagError
+from codetr_ros.bags.reader import Bag
+from codetr_ros.bags.recover import recover
+from codetr_ros.bags.verify import verify
+from codetr_ros.cli import main
+from codetr_ros.records import Commit, RunSpec, Transitions, TrueRewards
+
+RUN = a_run()
+
+
+def messages(path, on_damage=None):
+    """Everything that a message is, for comparison."""
+    return [
+        (m.channel.topic, m.channel.type, m.log_time, m.publish_time, m.sequence, bytes(m.data))
+        for m in Bag(path, on_damage).raw()
+    ]
+
+
+def flip(path, at):
+    data = bytearray(path.read_bytes())
+    data[at] ^= 1
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize('writer', WRITERS)
+def test_a_sound_bag_is_kept_byte_for_byte_whoever_wrote_it(writer, tmp_path):
+    bag = WRITERS[writer](tmp_path / 'bag', RUN)
+    found = recover(bag, tmp_path / 'new')
+    assert messages(tmp_path / 'new') == messages(bag)
+    assert found.verdict.sound and not found.lost and not found.faults
+
+
+def test_a_killed_recorders_bag_becomes_one_that_rosbags_opens(tmp_path):
+    bag = ours(tmp_path / 'bag', RUN)
+    whole = messages(bag)
+    commits = [entry.place for entry in Bag(bag).entries([Commit])]
+    os.truncate(commits[2].file, commits[2].offset + 50)
+    (bag / 'metadata.yaml').unlink()
+    before = (bag / 'bag_0.mcap').read_bytes()
+    found = recover(bag, tmp_path / 'new')
+    kept = messages(tmp_path / 'new')
+    assert kept == whole[: len(kept)] and len(kept) > 20
+    assert found.lost == 50 and found.verdict.sound
+    (run,) = found.verdict.runs.values()
+    assert (run.phases, run.whole) == (2, 2)
+    assert (bag / 'bag_0.mcap').read_bytes() == before
+    with AnyReader([tmp_path / 'new']) as reader:
+        assert [bytes(data) for _, _, data in reader.messages()] == [m[-1] for m in kept]
+        assert (
+            reader.topics['/run/transitions'].connections[0].ext.offered_qos_profiles[0].depth
+            == 10
+        )
+
+
+def test_a_damaged_chunk_is_left_out_and_what_is_missing_is_said_by_number(tmp_path):
+    bag = ours(tmp_path / 'bag', RUN, chunk_bytes=1)
+    places = [entry.place for entry in Bag(bag).entries()]
+    whole = messages(bag)
+    lost = next(i for i, record in enumerate(RUN) if isinstance(record, Commit)) - 3
+    flip(places[lost].file, places[lost].offset + 70)
+    found = recover(bag, tmp_path / 'new')
+    assert messages(tmp_path / 'new') == whole[:lost] + whole[lost + 1 :]
+    assert found.faults == 1 + 1, 'the chunk, and the count in the summary'
+    assert "transitions of 'sim': number 3 is missing before 4" in [
+        f.text for f in found.verdict.findings.named
+    ]
+    (run,) = found.verdict.runs.values()
+    assert (run.phases, run.whole) == (3, 0)
+
+
+def test_topics_are_taken_from_the_summary_where_the_chunk_that_described_them_is_damaged(
+    tmp_path,
+):
+    bag = ours(tmp_path / 'bag', RUN)
+    first = next(Bag(bag).entries()).place
+    whole = messages(bag)
+    flip(first.file, first.offset + 500)
+    found = recover(bag, tmp_path / 'new')
+    kept = messages(tmp_path / 'new')
+    assert kept == whole[-len(kept) :] and 0 < len(whole) - len(kept) < 10
+    assert found.lost > 500
+
+
+def test_what_comes_twice_stays_there_twice(tmp_path):
+    bag = ours(tmp_path / 'bag', [*RUN, RUN[2]])
+    recover(bag, tmp_path / 'new')
+    assert messages(tmp_path / 'new') == messages(bag)
+
+
+def test_a_missing_split_is_said_and_the_others_are_kept(tmp_path):
+    bag = ours(tmp_path / 'bag', a_run(phases=40), split_bytes=32_000)
+    (bag / 'bag_1.mcap').unlink()
+    found = recover(bag, tmp_path / 'new')
+    assert 'lacks bag_1.mcap' in found.said[0].text
+    assert any(f.kind == 'gap' for f in found.verdict.findings.named)
+    assert not any(f.kind in ('file', 'metadata', 'index') for f in found.verdict.findings.named)
+    assert messages(tmp_path / 'new') == messages(bag, lambda damage: None)
+
+
+def test_chunks_that_changed_places_stay_so_and_are_named(tmp_path):
+    bag = ours(tmp_path / 'bag', RUN, chunk_bytes=1)
+    path = bag / 'bag_0.mcap'
+    data = path.read_bytes()
+    places = [entry.place.offset for entry in Bag(bag).entries([Transitions])]
+    ends = [entry.place.offset for entry in Bag(bag).entries([TrueRewards])]
+    (a, b), (c, d) = zip(places[4:6], ends[4:6], strict=True)
+    path.write_bytes(data[:a] + data[c:d] + data[b:c] + data[a:b] + data[d:])
+    assert not verify(bag).sound
+    found = recover(bag, tmp_path / 'new')
+    assert len(messages(tmp_path / 'new')) == len(RUN)
+    assert {f.kind for f in found.verdict.findings.named} >= {'gap', 'duplicate'}
+
+
+def test_metadata_of_another_version_becomes_that_of_jazzy(tmp_path):
+    bag = ours(tmp_path / 'bag', RUN)
+    path = bag / 'metadata.yaml'
+    path.write_text(path.read_text().replace('version: 9', 'version: 99'))
+    assert recover(bag, tmp_path / 'new').verdict.sound
+    assert 'version: 9\n' in (tmp_path / 'new' / 'metadata.yaml').read_text()
+
+
+def test_bags_without_checksums_are_kept_too(tmp_path):
+    bag = by_mcap(CompressionType.NONE, use_chunking=False)(tmp_path / 'bag', RUN)
+    path = bag / 'a.mcap'
+    whole = messages(bag)
+    os.truncate(path, path.stat().st_size * 3 // 4)
+    recover(bag, tmp_path / 'new')
+    kept = messages(tmp_path / 'new')
+    assert kept == whole[: len(kept)] and len(kept) > 10
+
+
+def test_nothing_is_written_where_nothing_can_be_read_or_something_is(tmp_path):
+    (tmp_path / 'bag.mcap').write_bytes(b'')
+    with pytest.raises(BagError, match='no message of .* can be read.*is empty'):
+        recover(tmp_path / 'bag.mcap', tmp_path / 'new')
+    bag = ours(tmp_path / 'bag', RUN)
+    with pytest.raises(BagError, match='exists and holds bag_0.mcap: choose another'):
+        recover(bag, bag)
+
+
+def test_a_full_disk_is_said(tmp_path):
+    bag = ours(tmp_path / 'bag', RUN)
+    program = """
+        import resource, sys
+        from codetr_ros.bags.recover import recover, BagError
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
+        try:
+            recover(*sys.argv[1:])
+        except BagError as error:
+            print(error)
+    """
+    done = subprocess.run(
+        [sys.executable, '-c', textwrap.dedent(program), str(bag), str(tmp_path / 'new')],
+        capture_output=True, text=True, check=False, timeout=60,
+    )  # fmt: skip
+    assert 'cannot be written: File too large' in done.stdout, done.stderr
+
+
+def test_the_command_says_what_was_lost_and_up_to_where_the_run_is_whole(tmp_path, capsys):
+    bag = ours(tmp_path / 'bag', RUN)
+    commits = [entry.place for entry in Bag(bag).entries([Commit])]
+    os.truncate(commits[2].file, commits[2].offset + 50)
+    assert main(['bag', 'recover', str(bag), '--out', str(tmp_path / 'new')]) == 0
+    said = capsys.readouterr().out
+    assert 'whole up to phase 1, 2 phases were committed' in said
+    assert f'50 bytes of {bag} could not be read' in said
+    assert main(['bag', 'recover', str(bag), '--out', str(tmp_path / 'b'), '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['verdict']['runs'][0]['phases_whole'] == 2
+    assert main(['bag', 'recover', str(tmp_path / 'no'), '--out', str(tmp_path / 'c')]) == 2
+    assert verify(tmp_path / 'new').sound
+
+
+def test_a_recovered_bag_is_read_as_the_run_that_it_was(tmp_path):
+    bag = ours(tmp_path / 'bag', RUN)
+    os.truncate(bag / 'bag_0.mcap', (bag / 'bag_0.mcap').stat().st_size - 10)
+    recover(bag, tmp_path / 'new')
+    (spec,) = Bag(tmp_path / 'new').entries([RunSpec])
+    assert spec.record.settings == RUN[0].settings
