@@ -1,23 +1,15 @@
 """The report of a run for people: a picture of the learning curve and one HTML page."""
 
 import base64
-import html
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from codetr_ros import run_folder
+from codetr_ros.pages import STYLE, flat, records, table, text
 
 _TRUE, _SCORE = '#1f5fa8', '#b8561c'
-_STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem;
-color: #222 } h1 { font-size: 1.4rem } h2 { font-size: 1.1rem; margin-top: 2rem } table { border-
-collapse: collapse } td, th { padding: .15rem .8rem .15rem 0; text-align: right; border-bottom: 1px
-solid #ddd } td:first-child, th:first-child { text-align: left } th { font-weight: 600 } img { max-
-width: 100% } .bad { color: #b00020; font-weight: 600 } code { font-size: .9em; overflow-wrap:
-anywhere }
-"""
 
 
 def title(summary: Mapping[str, Any]) -> str:
@@ -90,24 +82,24 @@ def page(summary: Mapping[str, Any], picture: bytes) -> str:
     shown = base64.b64encode(picture).decode()
     parts = [
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">',
-        f'<title>{_text(title(summary))}</title><style>{_STYLE}</style></head><body>',
-        f'<h1>{_text(title(summary))}</h1>',
-        f'<p class="bad">{_text(summary["failure"])}</p>' if summary['failure'] else '',
+        f'<title>{text(title(summary))}</title><style>{STYLE}</style></head><body>',
+        f'<h1>{text(title(summary))}</h1>',
+        f'<p class="bad">{text(summary["failure"])}</p>' if summary['failure'] else '',
         f'<img alt="learning curve" src="data:image/png;base64,{shown}">',
         '<h2>Result</h2>',
-        _table(['', ''], [[name, value] for name, value in result_rows(summary)]),
+        table(['', ''], [[name, value] for name, value in result_rows(summary)]),
         '<p>The score is the composite return of an episode over that of an agent that earns the '
         "task's largest reward at every step.</p>",
         '<h2>Evaluations</h2>',
-        _records(([summary['random']] if summary['random'] else []) + summary['evaluations']),
+        records(([summary['random']] if summary['random'] else []) + summary['evaluations']),
         '<h2>Messages</h2>',
         _messages(summary['messages']),
         '<h2>Processes</h2>',
-        _records([{'process': name, **row} for name, row in summary['processes'].items()]),
+        records([{'process': name, **row} for name, row in summary['processes'].items()]),
         '<h2>Settings</h2>',
-        _table(['setting', 'value'], list(_flat(summary['settings']))),
+        table(['setting', 'value'], list(flat(summary['settings']))),
         '<h2>Identity</h2>',
-        _table(
+        table(
             ['', ''],
             [
                 [name, summary[name]]
@@ -171,42 +163,5 @@ def write(folder: Path, summary: Mapping[str, Any]) -> None:
     run_folder.atomic_write(folder / run_folder.REPORT, page(summary, picture))
 
 
-def _text(value: Any) -> str:
-    if value is None:
-        return ''
-    if isinstance(value, float):
-        return f'{value:.6g}'
-    return html.escape(
-        ', '.join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
-    )
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    head = ''.join(f'<th>{_text(name)}</th>' for name in header)
-    body = ''.join(
-        '<tr>' + ''.join(f'<td>{_text(cell)}</td>' for cell in row) + '</tr>\n' for row in rows
-    )
-    return f'<table>{f"<tr>{head}</tr>" if any(header) else ""}\n{body}</table>'
-
-
-def _records(rows: Sequence[Mapping[str, Any]]) -> str:
-    if not rows:
-        return '<p>none</p>'
-    names = list(rows[0])
-    return _table(
-        [n.replace('_', ' ') for n in names], [[row.get(n) for n in names] for row in rows]
-    )
-
-
 def _messages(messages: Mapping[str, Mapping[str, int]]) -> str:
-    return _records([{'topic': topic, **row} for topic, row in messages.items()])
-
-
-def _flat(settings: Mapping[str, Any], prefix: str = '') -> list[list[Any]]:
-    found: list[list[Any]] = []
-    for name, value in settings.items():
-        if isinstance(value, Mapping):
-            found += _flat(value, f'{prefix}{name}.')
-        else:
-            found.append([prefix + name, value])
-    return found
+    return records([{'topic': topic, **row} for topic, row in messages.items()])
