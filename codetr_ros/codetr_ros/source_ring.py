@@ -66,6 +66,8 @@ class SourceRing:
         self.actions[rows] = chunk.actions
         self.labels[rows] = np.nan
         self.versions[rows] = 0
+        if self.true_rewards is not None:
+            self.true_rewards[rows] = np.nan
         self.terminated[rows] = False
         self.last[rows] = False
         if episode.steps:

@@ -62,6 +62,9 @@ class Trajectories:
         margin: steps that may be held beyond the capacity before `evict` is called: a phase and an
             episode.
         true_rewards: keep the environment's own rewards too, for the oracle.
+        regular: segments have `delay` steps and follow on each other from an episode's first step
+            on, only its last is shorter. Else they may lie anywhere and have 1 to `delay` steps:
+            that no two share a step is for the caller to see to.
     """
 
     def __init__(
@@ -72,6 +75,7 @@ class Trajectories:
         capacity: int,
         margin: int,
         true_rewards: bool = False,
+        regular: bool = True,
     ) -> None:
         self.observation_size = observation_size
         self.action_size = action_size
@@ -80,6 +84,7 @@ class Trajectories:
         self.evicted = 0
         self._margin = margin
         self._true_rewards = true_rewards
+        self._regular = regular
         self._sources: dict[str, SourceRing] = {}
         self._order = 0
         self._sampleable: tuple[NDArray[np.int64], list[SourceRing]] | None = None
@@ -171,16 +176,11 @@ class Trajectories:
                 f'{named}: no such episode is here (never sent, or evicted); score segments of '
                 'steps sent'
             )
-        last = reward.first_step + reward.length
-        whole = reward.length == self.delay
-        cut_short = episode.ended and last == episode.steps and 0 < reward.length < self.delay
-        if reward.first_step % self.delay or last > episode.steps or not (whole or cut_short):
+        if fault := (self._off_grid if self._regular else self._amiss)(reward, episode):
+            ended = ' and ended' if episode.ended else ''
             raise RecordError(
-                f'{named}: there is no such segment. Segments have {self.delay} steps, start at '
-                'multiples of '
-                f'{self.delay} and only the last of an ended episode is shorter; this episode has '
-                f'{episode.steps} steps'
-                f'{" and ended" if episode.ended else ""}'
+                f'{named}: there is no such segment. {fault}; this episode has {episode.steps} '
+                f'steps{ended}'
             )
         if reward.first_step in episode.scored:
             raise RecordError(
@@ -194,6 +194,25 @@ class Trajectories:
             reward.value,
         )
         self._ids = None
+
+    def _off_grid(self, reward: CompositeReward, episode: Episode) -> str | None:
+        """What is wrong with a segment, where all segments are regular."""
+        last = reward.first_step + reward.length
+        whole = reward.length == self.delay
+        cut_short = episode.ended and last == episode.steps and 0 < reward.length < self.delay
+        if reward.first_step % self.delay == 0 and last <= episode.steps and (whole or cut_short):
+            return None
+        return (
+            f'Segments have {self.delay} steps, start at multiples of {self.delay} and only the '
+            'last of an ended episode is shorter'
+        )
+
+    def _amiss(self, reward: CompositeReward, episode: Episode) -> str | None:
+        """What is wrong with a segment, where they may lie anywhere."""
+        inside = reward.first_step + reward.length <= episode.steps
+        if inside and 0 < reward.length <= self.delay:
+            return None
+        return f'Segments have 1 to {self.delay} steps of those sent'
 
     def evict(self) -> int:
         """Drop whole episodes, oldest first, until at most `capacity` steps are held; how many
