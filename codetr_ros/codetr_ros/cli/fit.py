@@ -1,22 +1,27 @@
 """`codetr fit`: a reward model from bags, without any node."""
 
 import dataclasses
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.console import Console
 
 from codetr_ros import config, run_folder
 from codetr_ros.bags.errors import BagError
-from codetr_ros.cli import refuse
+from codetr_ros.cli import FAILED, refuse
 from codetr_ros.cli.flags import settings_fields
 from codetr_ros.config import Settings, SettingsError
 from codetr_ros.offline.errors import FitError
-from codetr_ros.offline.settings import FitSettings
+from codetr_ros.offline.settings import OF_NO_EFFECT, FitSettings
 from codetr_ros.run_folder import RunFolderError
+
+if TYPE_CHECKING:
+    from codetr_ros.offline.episodes import Index
+    from codetr_ros.offline.fitting import Check
 
 DESCRIPTION = """Fit a reward model to bags, without any node and without ROS.
 
@@ -24,15 +29,6 @@ The bags hold Transitions and CompositeReward messages: those of `codetr train`,
 Settings that are not given are those of the first bag's run, where it says what they are, else of
 the preset `quick`. The folder DIR then has a checkpoint that a reward node starts from, a summary
 and a report."""
-
-OF_NO_EFFECT = frozenset(
-    [
-        *('task', 'composite', 'beta', 'steps', 'phase_steps', 'warmup_steps', 'overlap'),
-        *('simulators', 'evaluate_every', 'evaluate_episodes', 'r_max', 'record_relabels'),
-        'sac',
-    ]
-)
-"""Settings about simulating and about learning a policy: facts of the data, or of no interest."""
 
 
 def _own_fields() -> list[tuple[str, Any, Any]]:
@@ -101,15 +97,103 @@ def main(arguments: Sequence[str]) -> int:
     try:
         given = parse(arguments, config.load('quick'))
         run_folder.check(given.out)
-        if given.fit.schedule == 'phases':
-            return _phases(arguments, given)
-        raise FitError('not yet')
+        from codetr_ros.rewards import RewardModelError
+
+        try:
+            return (_phases if given.fit.schedule == 'phases' else _epochs)(arguments, given)
+        except RewardModelError as error:
+            print(f'codetr: {error}', file=sys.stderr)
+            return FAILED
     except (SettingsError, RunFolderError, FitError, BagError) as error:
         return refuse(str(error))
 
 
+def _epochs(arguments: Sequence[str], given: Arguments) -> int:
+    from codetr_ros import checkpoints
+    from codetr_ros.offline import fitting, judging, report, results
+    from codetr_ros.offline.episodes import stretches
+
+    index, console = _index(given)
+    base = config.load(given.config) if given.config else index.base()
+    given = parse(arguments, base.changed(index.facts()))
+    settings = given.settings
+    _refuse_unfit(settings)
+    longest = min(given.fit.stretch_steps, max(1, settings.memory_steps // 4))
+    found = stretches(index, settings.delay, longest)
+    plan = fitting.plan(found.found, settings, given.fit)
+    folder = results.make_folder(given.out)
+    run_folder.write_settings(folder, settings)
+    console.print(
+        f'method {settings.method}, delay {settings.delay}: {len(plan.learnt)} stretches to learn '
+        f'from in {plan.passes} {"part" if plan.passes == 1 else "parts"}, '
+        f'{len(plan.held_out)} held out'
+    )
+    sizes = index.observation_size, index.action_size
+    fitted = fitting.fit(
+        index.bags,
+        plan,
+        sizes,
+        settings,
+        given.fit,
+        lambda check: console.print(_line(check, given.fit), markup=False),
+    )
+    meta = {
+        'run_id': '',
+        'settings': settings.canonical(),
+        'task': settings.task,
+        'observation_size': sizes[0],
+        'action_size': sizes[1],
+        'phase': 0,
+    }
+    checkpoints.save(folder / run_folder.CHECKPOINTS, 'reward', 0, fitted.method.state(), meta)
+    judged = judging.judge(fitted.method, fitted.held_out, judging.unit(fitted.method, settings))
+    summary = results.of_epochs(fitted, index, found, settings, given.fit, judged)
+    results.write(folder, summary)
+    report.write(folder, summary, judged)
+    results.show(summary, folder, console)
+    return 0
+
+
+def _line(check: 'Check', fit: FitSettings) -> str:
+    loss = '' if check.loss is None else f'loss {check.loss:.4g}, '
+    return (
+        f'step {check.gradient_steps} of at most {fit.gradient_steps}: {loss}'
+        f'held-out loss {check.held_out_loss:.4g}'
+    )
+
+
+def _index(given: Arguments) -> 'tuple[Index, Console]':
+    """Open the bags and go through them once."""
+    from codetr_ros.offline.episodes import Index
+    from codetr_ros.offline.sources import open_bags
+
+    console = Console(highlight=False, soft_wrap=True)
+    index = Index(open_bags(given.bags), given.run).read()
+    console.print(
+        f'{len(index.bags)} {"bag" if len(index.bags) == 1 else "bags"}: {index.steps} steps, '
+        f'{index.scores} scores, {len(index.episodes)} episodes'
+    )
+    return index, console
+
+
+def _refuse_unfit(settings: Settings) -> None:
+    from codetr_ros.rewards import METHODS
+
+    fit = [name for name in METHODS if name not in config.IN_PROCESS_ONLY]
+    if settings.method not in fit:
+        why = (
+            'a reference for `codetr train --in-process`'
+            if settings.method in config.IN_PROCESS_ONLY
+            else 'no reward model: its policy learner learns from the scores themselves'
+        )
+        raise FitError(
+            f'--method {settings.method} is {why}. Choose one of --method {"|".join(fit)}'
+        )
+
+
 def _phases(arguments: Sequence[str], given: Arguments) -> int:
-    from codetr_ros.offline import phases, results, sources
+    from codetr_ros.offline import judging, loading, phases, report, results, sources
+    from codetr_ros.offline.episodes import stretches
 
     if len(given.bags) != 1:
         raise FitError(
@@ -121,19 +205,19 @@ def _phases(arguments: Sequence[str], given: Arguments) -> int:
             f"--config {given.config}: --schedule phases learns under the run's own settings, "
             'which the bag holds; single settings may be changed by flags'
         )
-    bag = sources.open_bag(given.bags[0])
+    (bag,) = sources.open_bags(given.bags)
     run = sources.one_run(bag, given.run)
     own = sources.settings_of(run, bag)
-    given = parse(arguments, own)
+    given = parse([*arguments, '--run', run.run_id], own)
+    _refuse_unfit(given.settings)
     folder = results.make_folder(given.out)
     run_folder.write_settings(folder, given.settings)
-    console = Console(highlight=False)
+    index, console = _index(given)
     console.print(
-        f'run {run.run_id}: {own.task}, method {given.settings.method}, {own.phases} phases',
-        soft_wrap=True,
+        f'run {run.run_id}: {own.task}, method {given.settings.method}, {own.phases} phases'
     )
     began = time.perf_counter()
-    found = phases.fold(
+    folded = phases.fold(
         bag,
         run,
         given.settings,
@@ -141,7 +225,17 @@ def _phases(arguments: Sequence[str], given: Arguments) -> int:
         lambda text: console.print(text, style='yellow', markup=False),
         lambda phase, of: console.print(f'phase {phase} of {of}'),
     )
-    summary = results.of_phases(found, bag, own, time.perf_counter() - began)
+    seconds = time.perf_counter() - began
+    found = stretches(index, own.delay, given.fit.stretch_steps)
+    judged = None
+    if folded.core.method is not None and folded.core.method.target_scale:
+        newest = list(loading.newest(found.found, own.memory_steps))
+        sizes = index.observation_size, index.action_size
+        loaded = loading.load(index.bags, newest, sizes, own.delay, true_rewards=True)
+        unit = judging.unit(folded.core.method, given.settings)
+        judged = judging.judge(folded.core.method, loaded, unit)
+    summary = results.of_phases(folded, index, found, own, given.fit, judged, seconds)
     results.write(folder, summary)
+    report.write(folder, summary, judged)
     results.show(summary, folder, console)
     return 0

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from codetr_ros.bags.reader import Bag
 from codetr_ros.config import Settings
 from codetr_ros.offline.errors import FitError
-from codetr_ros.offline.standin import Bag
 from codetr_ros.records import (
     TOPICS,
     Commit,

@@ -1,5 +1,6 @@
 """What a fit leaves behind: its folder, its summary, what it says at the end."""
 
+import dataclasses
 import json
 import resource
 from collections.abc import Mapping
@@ -8,10 +9,14 @@ from typing import Any
 
 from rich.console import Console
 
-from codetr_ros import run_folder
+from codetr_ros import checkpoints, run_folder
+from codetr_ros.bags.reader import Bag
 from codetr_ros.config import Settings
+from codetr_ros.offline.episodes import Index, Stretches
+from codetr_ros.offline.fitting import Fitted
+from codetr_ros.offline.judging import MEASURES, Judgement
 from codetr_ros.offline.phases import Fold
-from codetr_ros.offline.standin import Bag
+from codetr_ros.offline.settings import FitSettings
 from codetr_ros.run_folder import RunFolderError
 
 DIGEST = 'reward_model_sha256'
@@ -51,30 +56,96 @@ def live_digest(bag: Bag) -> str | None:
     return found if isinstance(found, str) else None
 
 
-def of_phases(found: Fold, bag: Bag, own: Settings, seconds: float) -> dict[str, Any]:
-    """The summary of a fit that learnt as the run did."""
-    report = found.core.report()
-    changed = {
-        name: value for name, value in found.settings.flat().items() if own.flat()[name] != value
-    }
+def _common(
+    index: Index, found: Stretches, settings: Settings, fit: FitSettings, judged: Judgement | None
+) -> dict[str, Any]:
+    sources = sorted({f'{key.run_id}/{key.source}' for key, _ in index.episodes})
     return {
-        'schedule': 'phases',
-        'bags': [str(bag.path)],
-        'run_id': found.run.run_id,
-        'task': own.task,
-        'method': found.settings.method,
-        'settings': found.settings.model_dump(mode='json'),
+        'schedule': fit.schedule,
+        'bags': [str(bag.path) for bag in index.bags],
+        'runs': [run.run_id for _, run in index.runs],
+        'task': settings.task,
+        'method': settings.method,
+        'delay': settings.delay,
+        'settings': settings.model_dump(mode='json'),
+        'fit': fit.model_dump(mode='json'),
+        'data': {
+            'bags': ', '.join(str(bag.path) for bag in index.bags),
+            'sources': f'{len(sources)}: {", ".join(sources[:8])}'
+            + (', ...' if len(sources) > 8 else ''),
+            'observation size': index.observation_size,
+            'action size': index.action_size,
+            'episodes': len({(s.key, s.episode) for s in found.found}),
+            'steps': index.steps,
+            'steps that no score covers': found.unscored,
+            'scored segments': sum(len(s.segments.firsts) for s in found.found),
+        },
+        'metrics': judged.metrics if judged else dict.fromkeys(MEASURES),
+        'skipped': {name: n for name, n in found.skipped.items() if n},
+        'notes': index.notes,
+        'peak_rss_mb': peak_mb(),
+    }
+
+
+def of_phases(
+    folded: Fold,
+    index: Index,
+    found: Stretches,
+    own: Settings,
+    fit: FitSettings,
+    judged: Judgement | None,
+    seconds: float,
+) -> dict[str, Any]:
+    """The summary of a fit that learnt as the run did."""
+    report = folded.core.report()
+    changed = {
+        name: value for name, value in folded.settings.flat().items() if own.flat()[name] != value
+    }
+    said = _common(index, found, folded.settings, fit, judged)
+    said['skipped'] |= {f'{topic} refused': n for topic, n in folded.refused.items()}
+    return said | {
+        'run_id': folded.run.run_id,
         'changed_settings': changed,
-        'phases': found.phases,
+        'phases': folded.phases,
         'phases_of_the_run': own.phases,
         'gradient_steps': report.get('gradient_steps', 0),
-        'curve': [{'gradient_steps': n, 'loss': loss} for n, loss in found.losses],
+        'curve': [{'gradient_steps': n, 'loss': loss} for n, loss in folded.losses],
+        'judged_on': 'on data that it was trained on',
         DIGEST: report.get(DIGEST),
-        'live_' + DIGEST: live_digest(bag),
-        'recorded_labels': {'same': found.recorded.same, 'other': found.recorded.other},
-        'skipped': {f'{topic} refused': n for topic, n in found.refused.items()},
+        'live_' + DIGEST: live_digest(index.bags[0]),
+        'recorded_labels': {'same': folded.recorded.same, 'other': folded.recorded.other},
         'wall_s': seconds,
-        'peak_rss_mb': peak_mb(),
+    }
+
+
+def of_epochs(
+    fitted: Fitted,
+    index: Index,
+    found: Stretches,
+    settings: Settings,
+    fit: FitSettings,
+    judged: Judgement,
+) -> dict[str, Any]:
+    """The summary of a fit on all of the data."""
+    said = _common(index, found, settings, fit, judged)
+    held = fitted.held_out
+    said['data'] |= {
+        'held out': f'{len(held.stretches)} of {len(found.found)} stretches, '
+        f'{held.memory.steps} steps, {len(held.memory.segment_ids())} segments',
+        'steps held in memory at most': f'{fitted.most_steps} of memory_steps = '
+        f'{settings.memory_steps}, {held.memory.bytes_per_step} bytes each',
+        'times that the bags were read': 1 + fitted.reads,
+    }
+    return said | {
+        'gradient_steps': fitted.method.gradient_steps,
+        'curve': [dataclasses.asdict(check) for check in fitted.curve],
+        'best': dataclasses.asdict(fitted.best) if fitted.best else None,
+        'stopped': fitted.stopped,
+        'most_steps_held': fitted.most_steps,
+        'target_scale': fitted.method.target_scale,
+        'judged_on': 'on held-out episodes',
+        DIGEST: checkpoints.digest(fitted.method.state()),
+        'wall_s': fitted.seconds,
     }
 
 
@@ -88,30 +159,41 @@ def rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     """The few facts that people look for first, for the page and for the terminal."""
     found = [('gradient steps', str(summary['gradient_steps']))]
     if summary['schedule'] == 'phases':
-        found.append(('phases', f'{summary["phases"]} of {summary["phases_of_the_run"]}'))
         labels = summary['recorded_labels']
-        found.append(
+        found += [
+            ('phases', f'{summary["phases"]} of {summary["phases_of_the_run"]}'),
             (
-                'recorded labels',
-                f'{labels["same"]} segments the same, {labels["other"]} others',
-            )
-        )
-        live = summary['live_' + DIGEST]
-        if live:
-            same = live == summary[DIGEST]
-            found.append(
-                ('as the run itself', 'the same weights' if same else f'no, it ended with {live}')
-            )
-    found.append(('reward model sha256', str(summary[DIGEST])))
-    found += [(name, str(n)) for name, n in summary['skipped'].items()]
-    found.append(('time', f'{summary["wall_s"]:.1f} s'))
-    found.append(('peak memory', f'{summary["peak_rss_mb"]:.0f} MB'))
-    return found
+                'labels in the bag',
+                f'{labels["same"]} segments as made here, {labels["other"]} otherwise',
+            ),
+        ]
+        if live := summary['live_' + DIGEST]:
+            same = 'the same weights' if live == summary[DIGEST] else f'no, it ended with {live}'
+            found.append(('as the run itself', same))
+    else:
+        found.append(('ended', summary['stopped']))
+    metrics = summary['metrics']
+    for name, key in (
+        ('composite R²', 'composite_r2'),
+        ('Pearson', 'pearson'),
+        ('Pearson within segments', 'within_pearson'),
+        ('Spearman', 'spearman'),
+    ):
+        value = 'not known' if metrics[key] is None else f'{metrics[key]:.3f}'
+        found.append((name, f'{value} {summary["judged_on"]}'))
+    skipped = sum(summary['skipped'].values())
+    what = f': {", ".join(f"{n} {name}" for name, n in summary["skipped"].items())}'
+    return [
+        *found,
+        ('skipped', f'{skipped}{what if skipped else ""}'),
+        ('reward model sha256', str(summary[DIGEST])),
+        ('time', f'{summary["wall_s"]:.1f} s'),
+        ('peak memory', f'{summary["peak_rss_mb"]:.0f} MB'),
+    ]
 
 
 def show(summary: Mapping[str, Any], folder: Path, console: Console) -> None:
     """Print what came out of a fit."""
     console.print()
-    for name, text in rows(summary):
-        console.print(f'{name:<24}{text}', markup=False, soft_wrap=True)
-    console.print(f'{"output":<24}{folder}', markup=False, soft_wrap=True)
+    for name, said in (*rows(summary), ('report', str(folder / run_folder.REPORT))):
+        console.print(f'{name:<26}{said}', markup=False, soft_wrap=True)

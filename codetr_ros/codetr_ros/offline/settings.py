@@ -6,6 +6,15 @@ from pydantic import Field
 
 from codetr_ros.config import Group
 
+OF_NO_EFFECT = frozenset(
+    [
+        *('task', 'composite', 'beta', 'steps', 'phase_steps', 'warmup_steps', 'overlap'),
+        *('simulators', 'evaluate_every', 'evaluate_episodes', 'r_max', 'record_relabels'),
+        *('sac', 'hc'),
+    ]
+)
+"""Settings about simulating and about learning a policy: facts of the data, or of no interest."""
+
 
 class FitSettings(Group):
     """How a reward model is fitted to bags."""

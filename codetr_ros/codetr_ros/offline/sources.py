@@ -1,22 +1,35 @@
 """The bags that a command was given, and the runs that they say they are of."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from codetr_ros import run_folder
+from codetr_ros.bags.reader import Bag
 from codetr_ros.config import Settings, from_canonical
 from codetr_ros.offline.errors import FitError
-from codetr_ros.offline.standin import Bag
 from codetr_ros.records import RunSpec
 
 
-def open_bag(path: Path) -> Bag:
-    """A bag by its folder or file, or by the folder of the run that recorded it.
+def open_bags(paths: Sequence[Path]) -> list[Bag]:
+    """Bags by their folder or file, or by the folder of the run that recorded it.
 
     Raises:
         BagError: there is none, or it cannot be read.
+        FitError: one was given twice.
     """
-    inside = path / run_folder.BAG
-    return Bag(inside if (path / run_folder.CONFIG).is_file() and inside.is_dir() else path)
+    found = []
+    seen: dict[Path, Path] = {}
+    for path in paths:
+        inside = path / run_folder.BAG
+        bag = Bag(inside if (path / run_folder.CONFIG).is_file() and inside.is_dir() else path)
+        if (real := bag.path.resolve()) in seen:
+            raise FitError(
+                f'{path} is the same bag as {seen[real]}: its episodes would be learnt from and '
+                'held out at the same time'
+            )
+        seen[real] = path
+        found.append(bag)
+    return found
 
 
 def runs_of(bag: Bag) -> list[RunSpec]:

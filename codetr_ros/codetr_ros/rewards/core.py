@@ -54,6 +54,11 @@ class Labeller(Consumer):
         self._labelled_version = -1
         self._labelled = np.empty(0, np.int64)  # ids that have their first label
 
+    @property
+    def method(self) -> rewards.RewardMethod | None:
+        """The reward method, once the task's sizes are known."""
+        return self._method
+
     def _begin(self) -> Iterator[list[Record]]:
         spec = self._intake.tasks.first
         self._method = rewards.make(self._settings, spec.observation_size, spec.action_size)

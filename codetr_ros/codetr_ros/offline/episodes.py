@@ -1,0 +1,346 @@
+"""What bags hold to learn from: an index of their episodes and scores, made in one pass.
+
+The index has the places of steps, not the steps: it takes about a byte per step where a score
+comes every 25 steps. Nothing is trusted that cannot be: steps sent twice are taken once, a gap
+ends a piece, what is not finite is left out, and all of it is counted.
+"""
+
+from array import array
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from hashlib import blake2b
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from codetr_ros.bags.reader import Bag
+from codetr_ros.config import Settings, SettingsError, load
+from codetr_ros.offline.errors import FitError
+from codetr_ros.offline.sources import settings_of
+from codetr_ros.records import CompositeReward, RunSpec, TaskSpec, Transitions
+
+AGAIN = 'steps sent again'
+COPIES = 'steps of episodes that another bag holds too'
+UNSOUND = 'steps with values that are not finite'
+UNJOINED = 'breaks where the next observation is not the one before'
+NOT_FINITE = 'scores that are not finite'
+NO_STEPS = 'scores of steps that are not all there'
+OVERLAP = 'scores of steps that another score covers'
+TOO_LONG = 'scores of more steps than the delay'
+
+
+class Key(NamedTuple):
+    """Whose episodes: run ids need not be unique, so the bag is part of it."""
+
+    bag: int
+    run_id: str
+    source: str
+
+
+@dataclass(slots=True)
+class Piece:
+    """Consecutive steps of an episode, without a gap."""
+
+    first: int
+    steps: int
+    tail: bytes | None  # the last observation, while more may follow
+
+    @property
+    def end(self) -> int:
+        """The step after the last."""
+        return self.first + self.steps
+
+
+@dataclass(slots=True)
+class Episode:
+    """An episode as far as a bag has it."""
+
+    key: Key
+    number: int
+    pieces: list[Piece] = field(default_factory=list)
+    # its scores, in the order in which they came
+    firsts: 'array[int]' = field(default_factory=lambda: array('q'))
+    lengths: 'array[int]' = field(default_factory=lambda: array('q'))
+    values: 'array[float]' = field(default_factory=lambda: array('d'))
+
+    def follows(self, chunk: Transitions) -> Piece | None:
+        """The piece that steps go on with, if they do."""
+        last = self.pieces[-1] if self.pieces else None
+        return last if last and last.tail is not None and chunk.first_step == last.end else None
+
+
+@dataclass
+class Index:
+    """Everything in some bags that a reward model can be fitted on.
+
+    Args:
+        bags: the bags.
+        run_id: only what is of this run; of all if None.
+    """
+
+    bags: Sequence[Bag]
+    run_id: str | None = None
+    runs: list[tuple[int, RunSpec]] = field(default_factory=list)
+    settings: list[Settings] = field(default_factory=list)  # of the runs, where they are known
+    tasks: list[str] = field(default_factory=list)
+    observation_size: int = 0
+    action_size: int = 0
+    episodes: dict[tuple[Key, int], Episode] = field(default_factory=dict)
+    steps: int = 0
+    scores: int = 0
+    skipped: Counter[str] = field(default_factory=Counter)
+    notes: list[str] = field(default_factory=list)
+    _prints: dict[tuple[str, str, int, bytes], int] = field(default_factory=dict)
+    _copies: set[tuple[Key, int]] = field(default_factory=set)
+    _said_by: str = ''  # who said the sizes
+
+    def read(self, progress: Callable[[int], None] = lambda steps: None) -> 'Index':
+        """Go through the bags once.
+
+        Raises:
+            BagError: one cannot be read.
+            FitError: they are of different sizes, or of different composite rewards.
+        """
+        kinds = (RunSpec, TaskSpec, Transitions, CompositeReward)
+        for number, bag in enumerate(self.bags):
+            for entry in bag.entries(kinds):
+                record = entry.record
+                if self.run_id is not None and record.run_id != self.run_id:
+                    continue
+                if isinstance(record, RunSpec):
+                    self._run(number, record)
+                elif isinstance(record, TaskSpec):
+                    self._task(number, record)
+                elif isinstance(record, Transitions):
+                    self._take(Key(number, record.run_id, record.source), record)
+                    progress(self.steps)
+                elif isinstance(record, CompositeReward):
+                    self._score(Key(number, record.run_id, record.source), record)
+        if not self.steps:
+            raise FitError(
+                f'{", ".join(str(b.path) for b in self.bags)}: no Transitions'
+                f'{f" of run {self.run_id!r}" if self.run_id else ""} to learn from: '
+                '`codetr convert` makes them of other topics'
+            )
+        if not self.scores:
+            raise FitError(
+                f'{", ".join(str(b.path) for b in self.bags)}: {self.steps} steps, but no '
+                'CompositeReward: nothing says how good they were'
+            )
+        return self
+
+    def _run(self, number: int, run: RunSpec) -> None:
+        if any(known.run_id == run.run_id and bag == number for bag, known in self.runs):
+            return
+        self.runs.append((number, run))
+        try:
+            mine = settings_of(run, self.bags[number])
+        except SettingsError as error:  # of another version: its data is as good
+            self.notes.append(f'settings not known: {error}')
+            return
+        for other in self.settings:
+            if (other.composite, other.beta) != (mine.composite, mine.beta):
+                raise FitError(
+                    f'run {run.run_id!r} in {self.bags[number].path} is scored by '
+                    f'composite = {mine.composite} (beta = {mine.beta:g}), another one by '
+                    f'{other.composite} (beta = {other.beta:g}): one model cannot learn both, '
+                    'fit them apart'
+                )
+        self.settings.append(mine)
+
+    def _task(self, number: int, spec: TaskSpec) -> None:
+        who = f'{spec.source!r} in {self.bags[number].path}'
+        self._sizes(spec.observation_size, spec.action_size, who)
+        if spec.task not in self.tasks:
+            self.tasks.append(spec.task)
+            if len(self.tasks) > 1:
+                self.notes.append(f'several tasks of the same sizes: {", ".join(self.tasks)}')
+
+    def _sizes(self, observations: int, actions: int, who: str) -> None:
+        if not self._said_by:
+            self.observation_size, self.action_size = observations, actions
+            self._said_by = who
+        for name, mine, theirs in (
+            ('observation', observations, self.observation_size),
+            ('action', actions, self.action_size),
+        ):
+            if mine != theirs:
+                raise FitError(
+                    f'{who} has {name} size {mine}, {self._said_by} has {theirs}: one model has '
+                    'one size, fit them apart'
+                )
+
+    def _take(self, key: Key, chunk: Transitions) -> None:
+        who = f'{chunk.source!r} in {self.bags[key.bag].path}'
+        self._sizes(chunk.observations.shape[1], chunk.actions.shape[1], who)
+        if not sound(chunk):
+            self.skipped[UNSOUND] += chunk.steps
+            return
+        place = (key, chunk.episode)
+        if place in self._copies or self._copied(place, chunk):
+            self.skipped[COPIES] += chunk.steps
+            return
+        episode = self.episodes.get(place)
+        if episode is None:
+            episode = self.episodes[place] = Episode(key, chunk.episode)
+        end = chunk.first_step + chunk.steps
+        if any(p.first < end and chunk.first_step < p.end for p in episode.pieces):
+            self.skipped[AGAIN] += chunk.steps
+            return
+        piece = episode.follows(chunk)
+        if piece is not None and piece.tail != chunk.observations[0].tobytes():
+            self.skipped[UNJOINED] += 1
+            piece = None
+        if piece is None:
+            for old in episode.pieces:
+                old.tail = None
+            piece = Piece(chunk.first_step, 0, None)
+            episode.pieces.append(piece)
+        piece.steps += chunk.steps
+        ended = chunk.terminated or chunk.truncated
+        piece.tail = None if ended else chunk.observations[-1].tobytes()
+        self.steps += chunk.steps
+
+    def _copied(self, place: tuple[Key, int], chunk: Transitions) -> bool:
+        """Whether an episode that begins here is in an earlier bag already, byte for byte."""
+        if len(self.bags) == 1 or place in self.episodes:
+            return False
+        print_of = blake2b(chunk.observations.tobytes(), digest_size=8)
+        print_of.update(chunk.actions.tobytes())
+        key, number = place
+        seen = (key.run_id, key.source, number, print_of.digest())
+        if self._prints.setdefault(seen, key.bag) == key.bag:
+            return False
+        self._copies.add(place)
+        return True
+
+    def _score(self, key: Key, reward: CompositeReward) -> None:
+        if not np.isfinite(reward.value):
+            self.skipped[NOT_FINITE] += 1
+            return
+        place = (key, reward.episode)
+        if place in self._copies:
+            return
+        episode = self.episodes.get(place)
+        if episode is None:  # its steps may follow: the topics are not ordered among each other
+            episode = self.episodes[place] = Episode(key, reward.episode)
+        episode.firsts.append(reward.first_step)
+        episode.lengths.append(reward.length)
+        episode.values.append(reward.value)
+        self.scores += 1
+
+    @property
+    def longest(self) -> int:
+        """Steps of the longest scored segment whose steps are there; 1 if there is none."""
+        found = 1
+        for episode in self.episodes.values():
+            most = max((piece.steps for piece in episode.pieces), default=0)
+            found = max(found, max((n for n in episode.lengths if n <= most), default=1))
+        return found
+
+    def base(self) -> Settings:
+        """The settings of the first run that says what they are, else of the preset `quick`."""
+        return self.settings[0] if self.settings else load('quick')
+
+    def facts(self) -> dict[str, Any]:
+        """Settings that the data decides: the task, and the steps that a score is of."""
+        known = max((settings.delay for settings in self.settings), default=0)
+        delay = max(known, self.longest)
+        if delay != known:
+            self.notes.append(
+                f'delay = {delay}, the longest scored segment: no run in the bags says what it was'
+            )
+        tasks = [*self.tasks, *(settings.task for settings in self.settings), 'unknown']
+        return {'delay': delay, 'task': tasks[0]}
+
+
+def sound(chunk: Transitions) -> bool:
+    """Whether all numbers of some steps are finite."""
+    return bool(np.isfinite(chunk.observations).all() and np.isfinite(chunk.actions).all())
+
+
+class Segments(NamedTuple):
+    """Scored segments of one stretch, in order of their steps."""
+
+    firsts: np.ndarray  # within the episode
+    lengths: np.ndarray
+    values: np.ndarray
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Stretch:
+    """Part of an episode with its scored segments: held out or learnt from as a whole."""
+
+    key: Key
+    episode: int
+    first: int  # within the episode
+    steps: int
+    segments: Segments
+
+
+@dataclass
+class Stretches:
+    """All that there is to learn from, and what is not."""
+
+    found: list[Stretch]
+    skipped: Counter[str]
+    unscored: int  # steps that no score covers
+
+
+def stretches(index: Index, delay: int, longest: int) -> Stretches:
+    """Cut what was indexed into stretches with scores.
+
+    Args:
+        index: what the bags hold.
+        delay: scores of more steps are left out.
+        longest: a longer piece is cut, between two segments, into stretches of about so many.
+    """
+    made = Stretches([], Counter(index.skipped), index.steps)
+    for episode in index.episodes.values():
+        segments = _sound_segments(episode, delay, made.skipped)
+        made.unscored -= int(segments.lengths.sum())
+        for piece in episode.pieces:
+            inside = (segments.firsts >= piece.first) & (
+                segments.firsts + segments.lengths <= piece.end
+            )
+            mine = Segments(*(part[inside] for part in segments))
+            made.found += _cut(episode, piece, mine, longest)
+    return made
+
+
+def _sound_segments(episode: Episode, delay: int, skipped: 'Counter[str]') -> Segments:
+    """The scores of an episode that are of steps which are there, each step in one at most."""
+    order = np.argsort(np.asarray(episode.firsts, np.int64), kind='stable')
+    firsts = np.asarray(episode.firsts, np.int64)[order]
+    lengths = np.asarray(episode.lengths, np.int64)[order]
+    values = np.asarray(episode.values, np.float64)[order]
+    there = np.zeros(len(firsts), bool)
+    for piece in episode.pieces:
+        there |= (firsts >= piece.first) & (firsts + lengths <= piece.end) & (lengths > 0)
+    short = lengths <= delay
+    keep = there & short
+    skipped[NO_STEPS] += int((~there).sum())
+    skipped[TOO_LONG] += int((there & ~short).sum())
+    end = -1
+    for i in np.flatnonzero(keep).tolist():
+        if firsts[i] < end:
+            keep[i] = False
+            skipped[OVERLAP] += 1
+        else:
+            end = int(firsts[i] + lengths[i])
+    return Segments(firsts[keep], lengths[keep], values[keep])
+
+
+def _cut(episode: Episode, piece: Piece, segments: Segments, longest: int) -> list[Stretch]:
+    found = []
+    begin, at = piece.first, 0
+    ends = segments.firsts + segments.lengths
+    while at < len(ends):
+        upto = max(at + 1, int(np.searchsorted(ends, begin + longest, side='right')))
+        last = upto == len(ends)
+        end = int(ends[upto - 1]) if not last or piece.end - begin > longest else piece.end
+        mine = Segments(*(part[at:upto] for part in segments))
+        found.append(Stretch(episode.key, episode.number, begin, end - begin, mine))
+        begin, at = end, upto
+    return found

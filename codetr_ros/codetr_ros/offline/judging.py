@@ -1,0 +1,150 @@
+"""How good a reward method is on data in a memory: its predictions, labels and attention."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from codetr_ros.config import Settings
+from codetr_ros.offline.fitting import BATCH, predictions
+from codetr_ros.offline.loading import Loaded
+from codetr_ros.records import F32, F64, I64
+from codetr_ros.recovery_metrics import r_squared, step_recovery
+from codetr_ros.rewards.codetr import Codetr
+from codetr_ros.rewards.ircr import Ircr
+from codetr_ros.rewards.learned import Learned
+from codetr_ros.rewards.method import RewardMethod
+
+MEASURES = (
+    *('segments', 'composite_r2', 'segments_with_true_rewards'),
+    *('pearson', 'spearman', 'within_pearson', 'within_spearman'),
+)
+"""What a judgement measures."""
+SHOWN = 6
+"""Segments of which a report shows every step."""
+
+
+@dataclass
+class Shown:
+    """Every step of one segment, for a picture."""
+
+    source: str
+    episode: int
+    first: int
+    value: float  # its composite reward
+    predicted: float | None
+    labels: F32
+    true: F32 | None
+    weights: F32 | None  # attention weights w, 1 on average
+
+
+@dataclass
+class Judgement:
+    """What a method makes of the segments of a memory."""
+
+    metrics: dict[str, float | None]
+    values: F64  # (S,) composite rewards
+    predicted: F64 | None  # (S,) the same as the model has it; None for rules
+    labels: F32  # steps whose true rewards are known, one after the other
+    true: F32
+    shown: list[Shown]
+
+
+def unit(method: RewardMethod, settings: Settings) -> float:
+    """What the labels of a method are to be multiplied by to be in the unit of scores."""
+    scaled = settings.reward_unit == 'scaled' and not isinstance(method, Ircr)
+    return method.target_scale if scaled else 1.0
+
+
+def judge(method: RewardMethod, loaded: Loaded, unit: float) -> Judgement:
+    """Label all segments of a memory and compare what can be compared.
+
+    Args:
+        method: the method, prepared.
+        loaded: the memory.
+        unit: by which labels are multiplied to be in the unit of scores.
+
+    Returns:
+        Of the metrics those that cannot be computed are None: there is no variance, or no true
+        reward is known.
+    """
+    memory = loaded.memory
+    ids = memory.segment_ids()
+    values = memory.scores(ids)
+    labels = labels_of(method, loaded, ids) * np.float32(unit)
+    true = true_rewards_of(loaded, ids)
+    inside = ~np.isnan(labels)
+    known = np.asarray((np.isfinite(true) | ~inside).all(1))
+    predicted = predictions(method, loaded) if isinstance(method, Learned) else None
+    metrics = {
+        'segments': float(len(ids)),
+        'composite_r2': r_squared(predicted, values) if predicted is not None else float('nan'),
+        'segments_with_true_rewards': float(known.sum()),
+        **step_recovery(labels[known], true[known], inside[known]),
+    }
+    return Judgement(
+        {name: None if np.isnan(value) else value for name, value in metrics.items()},
+        values,
+        predicted,
+        labels[known][inside[known]],
+        true[known][inside[known]],
+        _shown(method, loaded, ids, labels, true, known, predicted),
+    )
+
+
+def labels_of(method: RewardMethod, loaded: Loaded, ids: I64) -> F32:
+    """Step rewards (S, L) of segments, NaN beyond their ends."""
+    lengths = loaded.memory.lengths(ids)
+    found = np.full((len(ids), int(lengths.max())), np.nan, np.float32)
+    for i in range(0, len(ids), method.label_batch):
+        some = ids[i : i + method.label_batch]
+        joined = np.concatenate(list(method.label_passes(loaded.memory, some)))
+        mine = np.arange(found.shape[1]) < lengths[i : i + method.label_batch, None]
+        rows = found[i : i + method.label_batch]
+        rows[mine] = joined
+    return found
+
+
+def true_rewards_of(loaded: Loaded, ids: I64) -> F32:
+    """The environment's own rewards (S, L) of segments, NaN where they are not known."""
+    lengths = loaded.memory.lengths(ids)
+    found = np.full((len(ids), int(lengths.max())), np.nan, np.float32)
+    for i in range(0, len(ids), BATCH):
+        batch = loaded.memory.segment_batch(ids[i : i + BATCH])
+        if batch.true_rewards is not None:
+            found[i : i + BATCH, : batch.true_rewards.shape[1]] = batch.true_rewards
+    return found
+
+
+def _shown(
+    method: RewardMethod,
+    loaded: Loaded,
+    ids: I64,
+    labels: F32,
+    true: F32,
+    known: np.ndarray[Any, Any],
+    predicted: F64 | None,
+) -> list[Shown]:
+    """Segments for pictures: evenly from the lowest to the highest score."""
+    memory = loaded.memory
+    order = np.argsort(memory.scores(ids), kind='stable')
+    chosen = order[np.linspace(0, len(ids) - 1, min(SHOWN, len(ids))).round().astype(int)]
+    _, episodes, firsts, lengths = memory.segments(ids)[0]
+    found = []
+    for i in chosen.tolist():
+        stretch, length = loaded.stretches[int(episodes[i])], int(lengths[i])
+        batch = memory.segment_batch(ids[i : i + 1], method.context)
+        weights = method.components(batch)[0][0] if isinstance(method, Codetr) else None
+        found.append(
+            Shown(
+                stretch.key.source,
+                stretch.episode,
+                stretch.first + int(firsts[i]),
+                float(batch.values[0]),
+                float(predicted[i]) if predicted is not None else None,
+                labels[i, :length],
+                true[i, :length] if known[i] else None,
+                weights[batch.context[0] :] if weights is not None else None,
+            )
+        )
+    return found
