@@ -21,11 +21,17 @@ from codetr_ros.records import PROTOCOL_VERSION, RunSpec
 Composite = Literal[
     'sum', 'sum_square', 'square_sum', 'max', 'max_hard', 'max_log_sum_exp', 'max_times_n'
 ]
-Method = Literal['codetr', 'none', 'rbt', 'rrd', 'ircr', 'hc', 'mlp', 'uniform', 'true', 'ones']
+Method = Literal[
+    'codetr', 'none', 'rbt', 'rrd', 'ircr', 'hc', 'lirpg', 'mlp', 'uniform', 'true', 'ones'
+]
 Hidden = tuple[Annotated[int, Field(ge=1, le=65536)], ...]
-IN_PROCESS_ONLY: tuple[str, ...] = ('true', 'ones')
-"""Reference methods: they look at what no node may see (`true`) or ignore the scores (`ones`)."""
-SCORE_LEARNERS: tuple[str, ...] = ('hc',)
+IN_PROCESS_ONLY = {
+    'true': 'is a reference that looks at what no node may see',
+    'ones': 'is a reference that ignores the scores',
+    'lirpg': 'learns on-policy, each phase from its own steps alone',
+}
+"""Methods that run without nodes only, and what keeps them from it."""
+SCORE_LEARNERS: tuple[str, ...] = ('hc', 'lirpg')
 """Methods whose policy learner learns from the composite rewards themselves: no reward node labels
 steps for it."""
 PRESETS = ('quick', 'cpu', 'paper')
@@ -257,6 +263,41 @@ class HcSettings(Group):
     )
 
 
+class LirpgSettings(Group):
+    """PPO with a learnt intrinsic reward (section 6 of the method); the published constants."""
+
+    hidden: Hidden = Field(
+        (64, 64), min_length=1, max_length=8, description='hidden layer widths of all networks'
+    )
+    learning_rate: float = Field(
+        3e-4, gt=0, le=1, description='Adam learning rate of the policy and its value'
+    )
+    reward_learning_rate: float = Field(
+        1e-4,
+        gt=0,
+        le=1,
+        description='Adam learning rate of the intrinsic reward and the value of scores',
+    )
+    epsilon: float = Field(1e-5, gt=0, le=1, description="Adam's epsilon")
+    epochs: int = Field(10, ge=1, le=1000, description='passes over the steps of a phase')
+    batch: int = Field(64, ge=2, le=65536, description='steps in an update')
+    clip: float = Field(0.2, gt=0, le=1, description="clip range of PPO's probability ratio")
+    discount: float = Field(0.99, ge=0, le=1, description='discount factor gamma')
+    trace_decay: float = Field(
+        0.95, ge=0, le=1, description='lambda of the generalised advantage estimation'
+    )
+    intrinsic_coefficient: float = Field(
+        1.0, ge=0, le=1e6, description='weight of the intrinsic reward in what the policy learns'
+    )
+    extrinsic_coefficient: float = Field(
+        0.0, ge=0, le=1e6, description='weight of the scores in what the policy learns'
+    )
+    value_coefficient: float = Field(0.5, ge=0, le=1e6, description='weight of the value losses')
+    gradient_norm: float = Field(
+        0.5, gt=0, le=1e6, description='gradients are shortened to this norm'
+    )
+
+
 class Settings(Group):
     """Everything that the nodes of a run must agree on."""
 
@@ -335,6 +376,18 @@ class Settings(Group):
     )
     sac: SacSettings = Field(default_factory=SacSettings, description='the policy learner')
     hc: HcSettings = Field(default_factory=HcSettings, description='the critic of method hc')
+    lirpg: LirpgSettings = Field(
+        default_factory=LirpgSettings, description='the policy learner of method lirpg'
+    )
+
+    @model_validator(mode='after')
+    def _on_policy_in_lock_step(self) -> 'Settings':
+        if self.method == 'lirpg' and self.overlap:
+            raise ValueError(
+                'overlap=True with method=lirpg: it learns on-policy, from steps under the very '
+                'policy that it changes; set overlap=False'
+            )
+        return self
 
     @property
     def labels_steps(self) -> bool:
@@ -371,6 +424,13 @@ class Settings(Group):
     def steps_of(self, phase: int) -> int:
         """Environment steps of a phase, all simulators together; 0 beyond the last."""
         return max(0, min(self.phase_steps, self.steps - phase * self.phase_steps))
+
+    def shares_of(self, phase: int) -> list[int]:
+        """Steps that each simulator takes of a phase: the first ones take one more where it does
+        not divide.
+        """
+        share, rest = divmod(self.steps_of(phase), self.simulators)
+        return [share + (i < rest) for i in range(self.simulators)]
 
     def steps_after(self, version: int) -> int:
         """Environment steps that policy version `version` has learnt from."""

@@ -4,8 +4,21 @@ from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
-from codetr_ros.records import F32, Transitions
+from codetr_ros.records import F32, F64, Transitions
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Rollout:
+    """Steps in the order in which they were taken; T of them."""
+
+    observations: F32  # (T, O)
+    actions: F32  # (T, A)
+    rewards: F64  # (T,) the composite reward on the last step of a scored segment, 0 elsewhere
+    next_observations: F32  # (T, O)
+    terminated: NDArray[np.bool_]  # (T,)
+    last: NDArray[np.bool_]  # (T,) the next step, if any, does not follow on this one
 
 
 @dataclass(slots=True)
@@ -79,6 +92,29 @@ class SourceRing:
         self.finals[self.end - 1] = chunk.observations[-1].copy()
         self.last[rows[-1]] = True
         self.terminated[rows[-1]] = chunk.terminated
+
+    def newest_steps(self, count: int) -> Rollout:
+        """The last `count` steps, or as many as are held."""
+        first = max(self.start, self.end - count)
+        rows = np.arange(first, self.end)
+        slots = rows % self.capacity
+        following = self.observations[(slots + 1) % self.capacity]
+        last = self.last[slots]
+        for i in np.flatnonzero(last):
+            following[i] = self.finals[int(rows[i])]
+        rewards = np.zeros(len(rows), np.float64)
+        scored = slice(0, self.segments)
+        ends = self.segment_rows[scored] + self.segment_lengths[scored] - 1 - first
+        new = self.alive[scored] & (ends >= 0)
+        rewards[ends[new]] = self.segment_values[scored][new]
+        return Rollout(
+            self.observations[slots],
+            self.actions[slots],
+            rewards,
+            following,
+            self.terminated[slots],
+            last,
+        )
 
     def evict_oldest(self) -> int:
         """Drop the oldest episode with its segments; how many steps went."""

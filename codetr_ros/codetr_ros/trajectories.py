@@ -5,7 +5,7 @@ Both the reward side and the learner keep one. Each observation is stored once; 
 wrong record is refused and changes nothing.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +21,7 @@ from codetr_ros.records import (
     Transitions,
     TrueRewards,
 )
-from codetr_ros.source_ring import Episode, SourceRing
+from codetr_ros.source_ring import Episode, Rollout, SourceRing
 
 _SOURCE_SHIFT = 40
 """A segment id is (source index << 40) | number of the segment within its source."""
@@ -460,6 +460,16 @@ class Trajectories:
             )
             for _, source, _, at in self._by_source(ids)
         ]
+
+    def newest(self, counts: Sequence[int]) -> Rollout:
+        """The last steps of each source, in order of names: as many as `counts` says, or as are
+        held.
+        """
+        sources = [self._sources[name] for name in sorted(self._sources)]
+        # a source that has not taken any step yet is not among them
+        parts = [s.newest_steps(count) for s, count in zip(sources, counts, strict=False)]
+        fields = Rollout.__dataclass_fields__
+        return Rollout(*(np.concatenate([getattr(p, name) for p in parts]) for name in fields))
 
     def terminal(self, ids: I64) -> NDArray[np.bool_]:
         """Which segments (B,) ended in a terminal state."""

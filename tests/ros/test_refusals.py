@@ -14,7 +14,7 @@ from codetr_ros import middleware, run_folder
 from codetr_ros.bags.errors import BagError
 from codetr_ros.checkpoints import CheckpointError
 from codetr_ros.composite import CompositeError
-from codetr_ros.config import SettingsError, load
+from codetr_ros.config import IN_PROCESS_ONLY, SettingsError, load
 from codetr_ros.learners.network import NetworkError
 from codetr_ros.learners.sac import SacError
 from codetr_ros.records import RecordError
@@ -35,10 +35,10 @@ def refusal(*parameters, role='learner'):
     return said
 
 
-@pytest.mark.parametrize('method', ['true', 'ones'])
+@pytest.mark.parametrize('method', ['true', 'ones', 'lirpg'])
 def test_a_learner_refuses_a_method_that_runs_in_process_only(ros_domain, method):
     said = refusal(f'method:="{method}"')
-    assert f"method = '{method}' is a reference that runs in process only" in said
+    assert f"method = '{method}' {IN_PROCESS_ONLY[method]}" in said
     assert f'codetr train --in-process --method {method}' in said
 
 
@@ -48,7 +48,7 @@ def test_other_nodes_refuse_the_run_of_such_a_method_before_they_open_a_topic(pl
         play.until(lambda: node.poll() is not None)
         said = output(node)
     assert node.returncode == 1
-    assert "/r/record: method = 'true' is a reference that runs in process only" in said
+    assert "/r/record: method = 'true' is a reference that looks at" in said
     assert 'Traceback' not in said
     assert {said.settings_hash for said in play.presence_of('record')} == {''}  # no core either
 

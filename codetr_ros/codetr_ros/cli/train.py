@@ -74,7 +74,7 @@ def main(arguments: Sequence[str]) -> int:
         in_process = extra['in_process']
         if settings.method in config.IN_PROCESS_ONLY and not in_process:
             return refuse(
-                f'--method {settings.method} is a reference that looks at what no node may see: '
+                f'--method {settings.method} {config.IN_PROCESS_ONLY[settings.method]}: '
                 'it runs in process only. Add --in-process, or choose another --method'
             )
         tasks.check(settings, tasks.find(settings.task))

@@ -121,16 +121,13 @@ class Learner(Consumer):
         learner, settings = self._learner, self._settings
         assert learner is not None
         sources = self._intake.tasks.sources
-        steps = settings.steps_of(phase)
-        # the first simulators take one step more where the phase does not divide
-        shares = [steps // len(sources) + (i < steps % len(sources)) for i in range(len(sources))]
         random = phase < settings.warmup_phases
         return Policy(
             self._run.run_id,
             phase,
             version,
             sources,
-            np.array(shares, np.uint32),
+            np.array(settings.shares_of(phase), np.uint32),
             random,
             '' if random else learner.network,
             b'' if random else network.weights_bytes(learner.actor),

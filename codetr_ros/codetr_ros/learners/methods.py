@@ -6,8 +6,9 @@ from codetr_ros.config import Settings
 from codetr_ros.learners.from_labels import FromLabels
 from codetr_ros.learners.hc import HC
 from codetr_ros.learners.learner import PolicyLearner
+from codetr_ros.learners.lirpg import Lirpg
 
-METHODS: dict[str, Callable[[Settings, int, int], PolicyLearner]] = {'hc': HC}
+METHODS: dict[str, Callable[[Settings, int, int], PolicyLearner]] = {'hc': HC, 'lirpg': Lirpg}
 """Policy learners by the name that `settings.method` gives them. Every other method is one of
 rewards: it labels steps, and SAC learns from the labels."""
 

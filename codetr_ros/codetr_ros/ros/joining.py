@@ -20,15 +20,16 @@ IDLE = 0.05  # [s] blocked in the executor while there is nothing to do: the lon
 NAME_PATIENCE = 2.0  # [s] for the name of a node whose topics are known
 
 
-def refuse_reference(who: str, settings: Settings) -> None:
+def refuse_in_process_only(who: str, settings: Settings) -> None:
     """Refuse a method that is no node's business.
 
     Raises:
-        NodeError: the method looks at what no node may see, or ignores the scores.
+        NodeError: the method runs in process only.
     """
     if settings.method in IN_PROCESS_ONLY:
         raise NodeError(
-            f'{who}: method = {settings.method!r} is a reference that runs in process only: use '
+            f'{who}: method = {settings.method!r} {IN_PROCESS_ONLY[settings.method]}, so that it '
+            'runs in process only: use '
             f'`codetr train --in-process --method {settings.method}`, or start the learner with '
             f'another method'
         )
@@ -81,7 +82,7 @@ class Joining(Member):
         self.link.subscribe(RunSpec, self._take)
         if self.role == 'learner':
             self.settings = parameters.own_settings(self.link.node, self.values['config'])
-            refuse_reference(self.link.full_name, self.settings)
+            refuse_in_process_only(self.link.full_name, self.settings)
             tasks.check(self.settings, tasks.find(self.settings.task))
             if self.folder:
                 refuse_used_folder(self.link.full_name, self.folder, self.settings)
@@ -130,7 +131,7 @@ class Joining(Member):
             self.settings = from_canonical(
                 self.run_spec.settings, f'run {self.run_spec.run_id!r} of {owner}'
             )
-            refuse_reference(self.link.full_name, self.settings)
+            refuse_in_process_only(self.link.full_name, self.settings)
             refuse_idle_reward(self.link.full_name, self.role, self.settings)
             parameters.check_against_run(node, self.settings, owner)
         parameters.declare_settings(node, self.settings)
