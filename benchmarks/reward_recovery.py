@@ -56,6 +56,7 @@ VARIANTS: dict[str, dict[str, object]] = {
     'raw targets': {'target_scale': 'none'},
     'context episode': {'codetr.context': 'episode', 'codetr.window': 50},
     'method rbt': {'method': 'rbt'},
+    'method rbt, segment scope': {'method': 'rbt', 'rbt.attention_scope': 'segment'},
     'method rrd biased': {'method': 'rrd'},
     'method rrd unbiased': {'method': 'rrd', 'rrd.loss': 'unbiased'},
     'method mlp': {'method': 'mlp'},

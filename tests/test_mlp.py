@@ -44,7 +44,7 @@ def test_sixty_four_segments_are_learnt_by_heart():
 
 
 def test_the_loss_is_the_mean_squared_error_of_the_sums_in_units_of_the_target_scale():
-    data = memory()
+    data = memory((20, 11, 3))  # three segments are short
     made = trained(Mlp(settings(), O, A), data, 3)
     batch = data.sample_segments(generator(0, 'x'), settings().mlp.batch)
     expected = np.mean((made.predict(batch) - batch.values) ** 2) / data.score_scale() ** 2

@@ -10,7 +10,7 @@ import pytest
 import torch
 from builders import ACTION as A
 from builders import OBSERVATION as O
-from linear_rewards import DELAY, explained, memory, noise, trained
+from linear_rewards import DELAY, explained, memory, noise, recovery, trained
 
 from codetr_ros.rewards.codetr import Codetr
 from codetr_ros.rewards.method import segment_steps
@@ -28,6 +28,7 @@ def settings(**changes: Any):
         'codetr__head_scale': 'inverse_sqrt',
         'codetr__dropout': 0.0,
         'codetr__window': 10,
+        'rbt__attention_scope': 'segment',
     }
     return builders.tiny(**own | changes)
 
@@ -95,7 +96,7 @@ def test_a_label_depends_on_later_steps_of_its_segment_and_on_no_other_segment()
 def test_a_window_lets_labels_depend_on_the_steps_before_the_segment():
     data = filled()
     rbt = made(data, rbt__attention_scope='window')
-    assert rbt.context == 10
+    assert rbt.context == 7
     batch = whole(data, rbt.context)
     row = 1
     assert batch.context[row] == 7
@@ -108,29 +109,54 @@ def test_a_window_lets_labels_depend_on_the_steps_before_the_segment():
     assert (np.abs(after[row] - before[row])[inside] > 1e-7).all()
 
 
-@pytest.mark.parametrize('scope', ['segment', 'window'])
-def test_the_losses_are_those_of_the_segments_sums_and_of_the_next_observations(scope):
+@pytest.mark.parametrize(('scope', 'segments'), [('segment', 1), ('window', 3)])
+def test_the_losses_are_those_of_each_segments_sum_and_next_observations_in_runs_of_segments(
+    scope, segments
+):
     data = filled()
-    rbt = made(data, rbt__attention_scope=scope)
-    batch = data.sample_segments(generator(0, 'x'), settings().codetr.batch, rbt.context)
-    c = data.score_scale()
-    sums = np.mean((rbt.predict(batch) - batch.values) ** 2) / c**2
+    rbt = made(data, rbt__attention_scope=scope, codetr__window=21)
+    ids = data.segment_ids()
+    count = -(-settings().codetr.batch // segments)
+    last = ids[generator(0, 'x').integers(0, len(ids), count)]
     mean, std = data.observation_moments()
-    observations = (batch.observations - mean) / std
-    with torch.inference_mode():
-        _, predicted = rbt.network.eval()(
-            torch.tensor(observations[:, :-1], dtype=torch.float32),
-            torch.from_numpy(batch.actions),
-            torch.ones(batch.actions.shape[:2], dtype=torch.bool),
-        )
-    errors = [
-        (predicted[row, t].numpy() - observations[row, t + 1]) ** 2
-        for row, m in enumerate(batch.lengths.tolist())
-        for t in range(m)  # of a window all of it, of a segment itself
-    ]
+    ((_, episodes, firsts, _),) = data.segments(ids)
+    scores = dict(zip(zip(episodes, firsts, strict=True), data.scores(ids), strict=True))
+    sums, states = [], []
+    for number in last:  # one window at a time, cut from its episode's steps
+        batch = data.segment_batch(np.array([number]), 1000)  # all steps before it
+        begin = max(0, int(batch.context[0]) - (segments - 1) * 7)
+        end = int(batch.lengths[0])
+        observations = torch.tensor((batch.observations[0] - mean) / std, dtype=torch.float32)
+        with torch.inference_mode():
+            z, predicted = rbt.network.eval()(
+                observations[None, begin:end],
+                torch.from_numpy(batch.actions[None, 0, begin:end]),
+                torch.ones(1, end - begin, dtype=torch.bool),
+            )
+        errors = predicted[0] - observations[begin + 1 : end + 1]
+        states += errors.square().mean(1).tolist()
+        (episode,) = episodes[ids == number]
+        for first in range(begin, end, 7):
+            found = float(z[0, first - begin : first - begin + 7].sum())
+            sums.append((found - scores[episode, first] / data.score_scale()) ** 2)
     said = rbt.gradient_step(data, generator(0, 'x'))
-    assert said['reward_loss'] == pytest.approx(sums, rel=1e-4)
-    assert said['state_loss'] == pytest.approx(np.mean(errors), rel=1e-4)
+    assert said['reward_loss'] == pytest.approx(np.mean(sums), rel=1e-4)
+    assert said['state_loss'] == pytest.approx(np.mean(states), rel=1e-4)
+
+
+def test_where_the_attention_sees_several_segments_credit_inside_them_is_found():
+    data = memory()
+    config = settings(
+        delay=DELAY,
+        rbt__attention_scope='window',
+        codetr__window=3 * DELAY,
+        codetr__batch=48,
+        codetr__learning_rate=5e-3,
+        codetr__initialisation='gpt2',
+    )
+    method = trained(Rbt(config, O, A), data, 300)
+    found = recovery(method, memory(lengths=(64, 64), seed=1))
+    assert found > 0.5
 
 
 def test_the_next_observation_is_predicted_from_its_step_and_those_before_alone():

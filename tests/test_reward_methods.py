@@ -3,6 +3,7 @@
 from typing import Any, ClassVar
 
 import builders
+import linear_rewards
 import numpy as np
 import pytest
 import torch
@@ -230,6 +231,12 @@ class LearnedContract(Contract):
         assert {'reward_loss', 'learning_rate'} <= said.keys()
         assert all(type(value) is float and np.isfinite(value) for value in said.values())
 
+    def test_scale_and_moments_stay_as_they_were_first_measured(self):
+        made = self.trained(filled())
+        before = made.state()
+        made.prepare(linear_rewards.memory((24,), DELAY, seed=5))
+        assert equal(made.state(), before)
+
     def test_a_state_of_another_task_is_refused(self):
         made, other = self.make(), rewards.make(self.settings(), O + 1, A)
         with pytest.raises(RewardModelError, match=r'observation_mean is \(4,\).*expected \(3,\)'):
@@ -301,10 +308,9 @@ class TestRbt(LearnedContract):
         assert said.keys() == {'reward_loss', 'state_loss', 'learning_rate'}
 
 
-class TestRbtWithAWindow(TestRbt):
+class TestRbtOfSegments(TestRbt):
     changes: ClassVar[dict[str, Any]] = {
-        'rbt__attention_scope': 'window',
-        'codetr__window': 10,
+        'rbt__attention_scope': 'segment',
         'codetr__tokens': 'pair',
     }
 

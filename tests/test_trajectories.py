@@ -1,5 +1,6 @@
 """The memory D against a naive one that keeps everything in lists."""
 
+import builders
 import numpy as np
 import pytest
 
@@ -290,3 +291,44 @@ def test_scoring_and_evicting_for_long_keeps_the_table_of_segments_small():
     values = m.segment_batch(m.segment_ids()).values
     assert values.tolist() == [float(e) for e in range(395, 400) for _ in range(2)]
     assert m.nbytes < 80 * m.bytes_per_step + 200 * 41
+
+
+def test_runs_are_whole_scored_segments_of_one_episode_that_end_with_the_given_one():
+    memory = Trajectories(OBSERVATION, ACTION, 5, 1000, 100)
+    numbers = {}
+    for source, episode, steps, unscored in (
+        ('b', 0, 18, ()),
+        ('b', 1, 5, ()),
+        ('a', 0, 20, (5,)),
+    ):
+        memory.append(
+            builders.transitions(
+                source=source,
+                episode=episode,
+                steps=steps,
+                observations=np.zeros((steps + 1, OBSERVATION), np.float32),
+                actions=np.zeros((steps, ACTION), np.float32),
+                truncated=True,
+            )
+        )
+        for first in range(0, steps, 5):
+            if first not in unscored:
+                length = min(5, steps - first)
+                where = {'source': source, 'episode': episode, 'first_step': first}
+                memory.score(builders.score(length=length, **where))
+    for number in memory.segment_ids():
+        ((source, (episode,), (first,), _),) = memory.segments(np.array([number]))
+        numbers[source, int(episode), int(first)] = int(number)
+    names = {number: name for name, number in numbers.items()}
+    asked = [('b', 0, 15), ('b', 0, 5), ('b', 1, 0), ('a', 0, 15), ('a', 0, 0)]
+    runs = memory.runs(np.array([numbers[name] for name in asked]), 3)
+    assert [[names[int(number)][2] for number in run] for run in runs] == [
+        [5, 10, 15],
+        [0, 5],
+        [0],
+        [10, 15],  # the one at 5 has no score
+        [0],
+    ]
+    assert all(
+        names[int(n)][:2] == name[:2] for run, name in zip(runs, asked, strict=True) for n in run
+    )

@@ -149,9 +149,9 @@ class RbtSettings(Group):
         1.0, ge=0, le=1000, description='weight of the loss on the predicted next observation'
     )
     attention_scope: Literal['segment', 'window'] = Field(
-        'segment',
-        description='attention sees the segment only, or up to `codetr.window` steps before it '
-        'as well',
+        'window',
+        description='attention sees the segments that fit into `codetr.window` steps (two at '
+        'least), as published, or one only',
     )
 
 

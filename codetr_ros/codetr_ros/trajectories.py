@@ -416,6 +416,29 @@ class Trajectories:
             values[mine] = source.segment_values[at]
         return values
 
+    def runs(self, ids: I64, longest: int) -> list[I64]:
+        """Each segment with the whole ones right before it in its episode, in order.
+
+        Args:
+            ids: the segments with which the runs end.
+            longest: segments in a run at the most; those before the last have `delay` steps.
+        """
+        found = [ids[i : i + 1] for i in range(len(ids))]
+        for index, source, mine, at in self._by_source(ids):
+            for i, place in zip(mine.tolist(), at.tolist(), strict=True):
+                scored = source.by_number[int(source.segment_episodes[place])].scored
+                first = int(source.segment_offsets[place])
+                run: list[int] = []
+                while len(run) < longest - 1:
+                    number = scored.get(first - (len(run) + 1) * self.delay)
+                    if number is None:
+                        break
+                    if source.segment_lengths[number - source.first_segment] < self.delay:
+                        break
+                    run.append(number | index << _SOURCE_SHIFT)
+                found[i] = np.array([*reversed(run), ids[i]], np.int64)
+        return found
+
     def lengths(self, ids: I64) -> I64:
         """Steps of segments by id."""
         return self._spans(ids)[:, 1]

@@ -5,24 +5,28 @@ Tang et al., TMLR 2025 (arXiv 2402.03771): "reinforcement learning from bagged r
     R(segment) = sum_t z_t,    z_t = sum_j softmax_j(q_t k_j) v_j
 
 v_j is linear in the causal state of step j, and the softmax is bidirectional: CoDeTr's network,
-read in its rows where CoDeTr has its columns, so that with the same weights both predict the same
-sums (sum_t z_t = sum_j w_j v_j). The loss is the squared error of the sums plus that of the next
-observation, predicted from the causal state. Steps are labelled with z_t.
+read in its rows where CoDeTr has its columns. The loss is the squared error of the sums plus that
+of the next observation, predicted from the causal state. Steps are labelled with z_t.
+
+The attention must see more than one segment. Within a single one sum_t z_t = sum_j w_j v_j, which
+is what CoDeTr predicts with the same weights: any credit inside the segment gives the same sum,
+and what is learnt is arbitrary. Where a window has several segments, each with a score of its own,
+z_t must attend to its surroundings. `rbt.attention_scope` 'segment' is there to show that.
 
 What differs from the published code, as far as that could be read; the paper itself was not at
 hand:
 
 * There a batch is 64 windows of 500 consecutive steps, which cross episodes and cut bags, a cut
-  bag being scored by its share; all steps of a window attend to each other. Here it is segments,
-  as for CoDeTr: whole, of one episode, attending within themselves. With `rbt.attention_scope`
-  'window' up to `codetr.window` steps before a segment are seen and attended to as well; the loss
-  on sums remains the segment's own.
+  bag being scored by its share. Here windows are runs of whole segments of one episode: as many as
+  fit into `codetr.window` steps, two at least, and as many windows as make up `codetr.batch`
+  segments (fewer where episodes are shorter than a window).
 * There the loss on sums is divided by the number of steps, here by that of segments: it does not
   shrink where segments are long.
 * There actions precede states among the tokens, and the next state is predicted from the action's
   token, which has not seen the state. Here the token has seen both.
-* There labels are those of the last steps of windows of H = 100 steps, as here if
-  `codetr.labelling` is 'window'. By default whole segments are labelled, in one pass.
+* There a step's label is the output of the last step of the window of H = 100 steps that ends with
+  it, as here if `codetr.labelling` is 'window'. By default a segment's steps are labelled in one
+  pass, from the window of segments that ends with theirs.
 * Composite rewards are in units of the target scale c and observations, the predicted ones too,
   are standardised. Architecture, attention scale, initial weights, learning rate and number of
   gradient steps are by the settings `codetr`, so that RBT is compared with CoDeTr and not with
@@ -55,20 +59,35 @@ class Rbt(SequenceMethod):
     name: ClassVar[str] = 'rbt'
 
     def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
-        whole_window = settings.rbt.attention_scope == 'window'
-        context = settings.codetr.window if whole_window else 0
-        super().__init__(settings, observation_size, action_size, context, whole_window)
+        several = settings.rbt.attention_scope == 'window'
+        self._segments = max(2, settings.codetr.window // settings.delay) if several else 1
+        context = (self._segments - 1) * settings.delay
+        super().__init__(settings, observation_size, action_size, context, whole_window=several)
 
     def _make_network(self, observation_size: int, action_size: int) -> 'BagTransformer':
         return BagTransformer(observation_size, action_size, self._positions, self._codetr)
 
     def _terms(self, memory: Trajectories, rng: np.random.Generator) -> dict[str, Tensor]:
         """`reward_loss` of the sums, and `state_loss` of next observations times its weight."""
-        batch = memory.sample_segments(rng, self._codetr.batch, self.context)
-        observations, actions, inside = self._inputs(batch)
+        ids = memory.segment_ids()
+        last = ids[rng.integers(0, len(ids), -(-self._codetr.batch // self._segments))]
+        windows = memory.runs(last, self._segments)
+        batch = memory.segment_batch(np.concatenate(windows))  # (S, n): S segments of all windows
+        row, place = places([len(window) for window in windows])
+
+        def lay(each: Tensor) -> Tensor:
+            """Steps of segments (S, n, ...) side by side in their windows (B, L, ...)."""
+            laid = each.new_zeros(len(windows), int(place.max()) + 1, *each.shape[1:])
+            laid[row, place] = each
+            return laid.flatten(1, 2)
+
+        inside = lay(torch.from_numpy(segment_steps(batch)))  # (B, L)
+        observations = lay(self._standardised(batch.observations[:, :-1]))  # (B, L, O)
+        following = lay(self._standardised(batch.observations[:, 1:]))
+        actions = lay(torch.tensor(batch.actions))
         rewards, predicted = self.network(observations, actions, inside)  # (B, L), (B, L, O)
-        sums = (rewards * torch.from_numpy(segment_steps(batch))).sum(1)  # (B,)
-        following = self._standardised(batch.observations[:, 1:])  # (B, L, O)
+        shape = len(windows), -1, batch.actions.shape[1]
+        sums = rewards.view(shape)[row, place].sum(1)  # (S,)
         state_loss = (predicted - following)[inside].square().mean()
         return {
             'reward_loss': (sums - self._scaled(batch.values)).square().mean(),
@@ -78,6 +97,12 @@ class Rbt(SequenceMethod):
     def _step_rewards(self, batch: SegmentBatch) -> Tensor:
         rewards: Tensor = self.network(*self._inputs(batch))[0]
         return rewards
+
+
+def places(sizes: list[int]) -> tuple[Tensor, Tensor]:
+    """Of segments in windows of so many: which window each is in, and which of its segments."""
+    row = torch.repeat_interleave(torch.tensor(sizes))
+    return row, torch.cat([torch.arange(size) for size in sizes])
 
 
 class BagTransformer(nn.Module):
