@@ -38,7 +38,12 @@ from bootstrap_checks import (
 
 PIP = 'pip==26.3'
 """The pip that comes with Python 3.10 gives up on the requirements instead of resolving them."""
-REQUIREMENTS = ('requirements.txt', 'requirements-ros.txt', 'requirements-test.txt')
+REQUIREMENTS = (
+    'requirements.txt',
+    'requirements-ros.txt',
+    'requirements-test.txt',
+    'requirements-ray.txt',  # optional for users, but what it is for is tested
+)
 WITHOUT_DEPENDENCIES = 'requirements-no-deps.txt'
 PACKAGES = ('msgs', 'codetr_ros', 'sim_node', 'reward_node', 'learner_node')
 

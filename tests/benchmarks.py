@@ -37,7 +37,7 @@ def benchmark(path: Path, score: Score, **keys: Any) -> Folder:
     file.write_text(yaml.safe_dump({**given, **keys}))
     made = spec.load(file)
     folder = Folder(path)
-    folder.prepare(made, session(file, 1))
+    folder.prepare(made, session(file, 1, None))
     for cell in made.cells:
         said = score(cell)
         if said is not None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import secrets
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from typing import Any
 import pytest
 import yaml
 
+from codetr_ros import cli
 from codetr_ros.benchmark.folder import Folder
 
 TINY: dict[str, Any] = {
@@ -217,3 +219,103 @@ def _prepared(out: Path, path: Path) -> Folder:
     folder.path.mkdir(exist_ok=True)
     folder.prepare(made, {})
     return folder
+
+
+@pytest.mark.slow
+def test_on_ray_every_cell_ends_exactly_once_although_a_node_dies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in RAY.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv('RAY_AUTH_TOKEN_PATH', str(tmp_path / 'token'))
+    (tmp_path / 'token').write_text(secrets.token_hex(32))
+    cluster_utils = pytest.importorskip('ray.cluster_utils', reason='needs requirements-ray.txt')
+    spec, out = write(tmp_path / 'spec.yaml', steps=600, seeds=[0, 1, 2]), tmp_path / 'out'
+    cells = [f'InvertedPendulum-v5_sum_5_none_seed{seed}' for seed in (0, 1, 2)]
+    cluster = cluster_utils.Cluster(
+        initialize_head=True,
+        head_node_args={'num_cpus': 1, 'include_dashboard': False},
+    )
+    try:
+        doomed = cluster.add_node(num_cpus=1)
+        process = start(spec, out, '--ray', cluster.address)
+        running = wait(lambda: two_run(out, cells), 'a cell on each node')
+
+        cluster.remove_node(doomed, allow_graceful=False)
+
+        again = wait(lambda: begun_again(out, running), 'a second attempt')
+        said, _ = process.communicate(timeout=240)
+    finally:
+        cluster.shutdown()
+    assert process.returncode == 0, said
+    assert again in said
+    assert attempts(out) == []
+    assert not (out / 'aside').exists(), 'nothing was finished twice'
+    for cell in cells:
+        summary = json.loads((out / cell / 'summary.json').read_text())
+        assert (summary['steps'], summary['interrupted'], summary['failure']) == (
+            2000,
+            False,
+            None,
+        )
+        assert said.count(f'done: {cell} ') == 1
+
+
+RAY = {
+    'RAY_USAGE_STATS_ENABLED': '0',
+    # a node that says nothing for two seconds is dead
+    'RAY_health_check_initial_delay_ms': '1000',
+    'RAY_health_check_period_ms': '1000',
+    'RAY_health_check_failure_threshold': '2',
+}
+
+
+def two_run(out: Path, cells: list[str]) -> list[str]:
+    """The attempts at two cells, once both have begun; else nothing."""
+    running = [cell for cell in cells if begun(out, cell)]
+    return attempts(out) if len(running) == 2 else []
+
+
+def begun_again(out: Path, before: list[str]) -> str | None:
+    """A cell of which there is an attempt beside the one before."""
+    cells = {name.split('.')[0] for name in before}
+    for name in attempts(out):
+        cell = name.split('.')[0]
+        if cell in cells and name.removesuffix('.log') not in {
+            other.removesuffix('.log') for other in before
+        }:
+            return cell
+    return None
+
+
+@pytest.mark.parametrize('address', ['127.0.0.1:1', 'ray://127.0.0.1:1', 'nowhere'])
+def test_without_a_cluster_at_the_address_ray_is_refused(
+    address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip('ray', reason='needs requirements-ray.txt')
+    spec, out = write(tmp_path / 'spec.yaml'), tmp_path / 'out'
+
+    assert cli.main(['benchmark', 'run', str(spec), '--out', str(out), '--ray', address]) == 2
+
+    assert f'--ray {address}: the cluster cannot be reached' in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_ray_that_is_not_installed_is_refused_with_the_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, 'ray', None)
+    spec, out = write(tmp_path / 'spec.yaml'), tmp_path / 'out'
+
+    assert cli.main(['benchmark', 'run', str(spec), '--out', str(out), '--ray', 'local']) == 2
+
+    assert 'pip install -r requirements-ray.txt' in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_nothing_but_a_run_on_ray_imports_ray() -> None:
+    program = (
+        'import sys\nfrom codetr_ros.benchmark import overview, ray_pool, report, run, spec\n'
+        "assert 'ray' not in sys.modules"
+    )
+    subprocess.run([sys.executable, '-c', program], check=True)

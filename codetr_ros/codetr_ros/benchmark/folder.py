@@ -217,14 +217,14 @@ class Folder:
         atomic_write(self.path / INDEX, json.dumps(index, indent=1) + '\n')
 
     def clear_attempts(self) -> int:
-        """Remove what runners that are gone have left unfinished; how many runs."""
-        left = list(self.attempts.iterdir())
-        for path in left:
-            if path.is_dir():
-                shutil.rmtree(path)
-            else:
-                path.unlink()
-        return sum(path.suffix == '.log' for path in left)  # one for each
+        """Remove what was left unfinished by runners or nodes that are gone; how many runs."""
+        logs = list(self.attempts.glob('*.log'))  # one for each
+        for log in logs:
+            # whoever is cut off from the rest may still write there: a later runner tries again
+            shutil.rmtree(log.with_suffix(''), ignore_errors=True)
+            if not log.with_suffix('').exists():
+                log.unlink()
+        return len(logs)
 
     def set_aside(self, cell: str) -> Path | None:
         """Move away what lies in the cell's place, if anything; where to."""
@@ -253,12 +253,13 @@ def _flat(data: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]
             yield f'{prefix}{name}', value
 
 
-def session(spec: Path, workers: int) -> dict[str, Any]:
+def session(spec: Path, workers: int, ray: str | None) -> dict[str, Any]:
     """Who runs a benchmark: versions, commit, machine, time."""
     return {
         'began': time.strftime('%Y-%m-%dT%H:%M:%S%z'),
         'spec': str(spec),
         'workers': workers,
+        'ray': ray,
         **provenance(),
     }
 

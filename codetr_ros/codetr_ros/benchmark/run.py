@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from codetr_ros.benchmark import pool
+from codetr_ros.benchmark import pool, ray_pool
 from codetr_ros.benchmark.attempt import Job
 from codetr_ros.benchmark.folder import Folder, session
 from codetr_ros.benchmark.overview import Overview
@@ -16,6 +16,7 @@ def run(
     path: Path,
     out: Path,
     workers: int,
+    ray: str | None,
     retry_failed: bool,
     stopped: Callable[[], bool],
 ) -> dict[str, str]:
@@ -25,7 +26,8 @@ def run(
         spec: the benchmark.
         path: the file that it was read from.
         out: its folder.
-        workers: cells at a time.
+        workers: cells at a time; on Ray, as many as its nodes have cores for.
+        ray: address of a Ray cluster, `local` for one on this machine; None runs without Ray.
         retry_failed: run failed cells again.
         stopped: whether somebody wants to stop.
 
@@ -33,13 +35,15 @@ def run(
         The cells that have failed, now or before, and why.
 
     Raises:
-        BenchmarkError: another spec's folder, another runner in it.
+        BenchmarkError: another spec's folder, another runner in it, no Ray or no cluster.
     """
     folder = Folder(out)
     folder.check(spec)
+    if ray is not None:
+        ray_pool.check(ray)
     with folder.alone():
         folder.check(spec)  # nobody has changed it meanwhile, and nobody can from here on
-        folder.prepare(spec, session(path, workers))
+        folder.prepare(spec, session(path, workers, ray))
         left = folder.clear_attempts()
         jobs, failed = _todo(spec, folder, retry_failed)
         done = len(spec.cells) - len(jobs) - len(failed)
@@ -56,8 +60,11 @@ def run(
             if (aside := folder.set_aside(job.cell)) is not None:
                 overview.say(f'{job.cell} is not finished: what was there is now {aside}')
         with overview:
-            _warn(jobs, workers, overview)
-            pool.run(folder, jobs, workers, overview, stopped)
+            if ray is not None:
+                ray_pool.run(folder, jobs, ray, overview, stopped)
+            else:
+                _warn(jobs, workers, overview)
+                pool.run(folder, jobs, workers, overview, stopped)
     return failed | overview.failed
 
 

@@ -36,6 +36,14 @@ class Run:
             metavar='N', help='cells at a time, each with as many threads as its settings say'
         ),
     ] = 1
+    ray: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar='ADDRESS',
+            help='run the cells on a Ray cluster, whose nodes all see DIR, instead of in '
+            '--workers; `local` starts one on this machine',
+        ),
+    ] = None
     retry_failed: Annotated[
         bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help='run failed cells again')
     ] = False
@@ -86,6 +94,7 @@ def _run(given: Run) -> int:
                 path,
                 out,
                 given.workers,
+                given.ray,
                 given.retry_failed,
                 lambda: interrupts.count > 0,
             )
