@@ -76,7 +76,8 @@ def test_only_the_newest_steps_that_the_memory_holds_are_compared():
     rows = observe(
         true_rewards(0, 0, 1.0, 2.0, 3.0),
         true_rewards(1, 0, 5.0, 6.0, 4.0),
-        labels(0, (0, 0, [-1.0, -2.0]), (0, 2, [3.0]), (1, 0, [5.0, 6.0]), (1, 2, [4.0])),
+        labels(0, (0, 2, [3.0]), (1, 0, [5.0, 6.0]), (1, 2, [4.0]), part=0, parts=2),
+        labels(0, (0, 0, [-1.0, -2.0]), part=1, parts=2),
         settings=settings,
     )
 
