@@ -24,6 +24,7 @@ from codetr_ros.records import (
     Transitions,
     TrueRewards,
 )
+from codetr_ros.rewards import saved
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.trajectories import Trajectories
 
@@ -39,12 +40,33 @@ class Labeller(Consumer):
         settings: its settings.
         name: node name.
         folder: where checkpoints go; None keeps none.
+        checkpoint: a saved reward model to start from (`saved.read`); empty: a new one.
+        frozen: only label, as the checkpoint has it; else it goes on learning.
+
+    Raises:
+        CheckpointError: there is no such checkpoint, or it is damaged.
+        RewardModelError: `frozen` without a checkpoint.
     """
 
     role = 'reward'
     subscribes: tuple[type, ...] = (TaskSpec, Transitions, CompositeReward, Commit)
 
-    def __init__(self, run: RunSpec, settings: Settings, name: str, folder: Path | None) -> None:
+    def __init__(
+        self,
+        run: RunSpec,
+        settings: Settings,
+        name: str,
+        folder: Path | None,
+        checkpoint: str = '',
+        frozen: bool = False,
+    ) -> None:
+        if frozen and not checkpoint:
+            raise rewards.RewardModelError(
+                'frozen = true without a checkpoint: a model that has learnt nothing would label '
+                'and never learn. Give the checkpoint of a fit or a run, or leave frozen out'
+            )
+        self._start = saved.read(Path(checkpoint)) if checkpoint else None
+        self._frozen = frozen
         oracle = rewards.kind(settings).needs_true_rewards
         if oracle:
             self.subscribes = (*self.subscribes, TrueRewards)
@@ -61,7 +83,12 @@ class Labeller(Consumer):
 
     def _begin(self) -> Iterator[list[Record]]:
         spec = self._intake.tasks.first
-        self._method = rewards.make(self._settings, spec.observation_size, spec.action_size)
+        sizes = spec.observation_size, spec.action_size
+        self._method = (
+            rewards.make(self._settings, *sizes)
+            if self._start is None
+            else saved.restore(self._start, self._settings, *sizes)
+        )
         yield []
 
     def _learn(
@@ -72,7 +99,7 @@ class Labeller(Consumer):
         if not learns:
             self._phase = phase + 1
             return
-        if len(memory.segment_ids()):
+        if len(memory.segment_ids()) and not self._frozen:
             method.prepare(memory)
         metrics: dict[str, float] = {}
         for said in self._fit(phase, memory, method):
@@ -95,6 +122,8 @@ class Labeller(Consumer):
         self, phase: int, memory: Trajectories, method: rewards.RewardMethod
     ) -> Iterator[dict[str, float]]:
         steps = method.schedule.each if self._fitted else method.schedule.first
+        if self._frozen:
+            return
         if steps and not len(memory.segment_ids()):
             self._counters['gradient steps skipped, nothing scored'] += steps
             return
@@ -212,4 +241,10 @@ class Labeller(Consumer):
         if self._method is not None:
             said['gradient_steps'] = self._method.gradient_steps
             said['reward_model_sha256'] = checkpoints.digest(self._method.state())
+        if self._start is not None:
+            said['started_from'] = {
+                'checkpoint': str(self._start.path),
+                'reward_model_sha256': self._start.digest,
+                'frozen': self._frozen,
+            }
         return said

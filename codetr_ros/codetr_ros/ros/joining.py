@@ -150,7 +150,8 @@ class Joining(Member):
             self.folder.mkdir(parents=True, exist_ok=True)
             run_folder.write_settings(self.folder, self.settings)
         checkpoints = self.folder / run_folder.CHECKPOINTS if self.folder else None
-        self.core = make_core(self.run_spec, self.settings, self.link.name, checkpoints)
+        more = {name: self.values[name] for name in parameters.CORE_OF_ROLE.get(self.role, ())}
+        self.core = make_core(self.run_spec, self.settings, self.link.name, checkpoints, **more)
         self.link.advertise(published_by(self.role), self.settings)
         self.open_topics(self.settings)
         if hasattr(self.core, 'missing'):

@@ -31,9 +31,9 @@ from codetr_ros.ros.signals import Stop
 if TYPE_CHECKING:
     from codetr_ros.in_process import Core
 
-MakeCore = Callable[[RunSpec, Settings, str, Path | None], 'Core']
-"""Makes the core of a node: (run, settings, name within the run, folder of checkpoints or
-None)."""
+MakeCore = Callable[..., 'Core']
+"""Makes the core of a node: (run, settings, name within the run, folder of checkpoints or None),
+and by name those of the node's own parameters that `parameters.CORE_OF_ROLE` lists."""
 
 TELL_EVERY = 1.0  # [s] between two words of presence and diagnostics
 

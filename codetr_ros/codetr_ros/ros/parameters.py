@@ -35,16 +35,17 @@ class ParameterError(ValueError):
 class Own:
     """A parameter of the node itself, no setting of the run."""
 
-    default: str | float
+    default: str | float | bool
     description: str
     low: float = 0.0
     high: float = 86_400.0
 
     def descriptor(self) -> ParameterDescriptor:
         """What `ros2 param describe` shows."""
-        if isinstance(self.default, str):
+        if isinstance(self.default, (str, bool)):
+            kind = Type.STRING if isinstance(self.default, str) else Type.BOOL
             return ParameterDescriptor(
-                type=Type.STRING.value, description=self.description, read_only=True
+                type=kind.value, description=self.description, read_only=True
             )
         return ParameterDescriptor(
             type=Type.DOUBLE.value,
@@ -69,6 +70,17 @@ OWN_OF_ROLE: dict[str, dict[str, Own]] = {
             'quick', 'settings to start from: a preset (quick, cpu, paper) or a YAML file'
         ),
     },
+    'reward': {
+        'checkpoint': Own(
+            '',
+            'reward model to start from: the folder of a checkpoint, of a fit or of a run; empty: '
+            'a new one. It must be of the same method, sizes and settings that shape it',
+        ),
+        'frozen': Own(
+            False,
+            'label as the checkpoint does, without learning; else the model goes on learning',
+        ),
+    },
     'record': {
         'bag': Own(
             '',
@@ -88,6 +100,10 @@ OWN_OF_ROLE: dict[str, dict[str, Own]] = {
         ),
     },
 }
+
+
+CORE_OF_ROLE: dict[str, tuple[str, ...]] = {'reward': ('checkpoint', 'frozen')}
+"""Own parameters that the core of a role is made with."""
 
 
 def own_parameters(role: str) -> dict[str, Own]:
@@ -222,6 +238,12 @@ def declare_own(node: Node, role: str) -> dict[str, Any]:
         value = given.get(name, own.default)
         if isinstance(own.default, str):
             value = str(value)  # a run id of digits only arrives as a number
+        elif isinstance(own.default, bool):
+            if not isinstance(value, bool):
+                raise ParameterError(
+                    f'{node.get_fully_qualified_name()}: parameter {name} = {value!r} must be '
+                    f'true or false ({own.description})'
+                )
         elif (
             isinstance(value, bool)
             or not isinstance(value, (int, float))

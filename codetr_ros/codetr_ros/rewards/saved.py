@@ -1,0 +1,142 @@
+"""Reward models that were saved, by a fit or in a run, and go on elsewhere: read, compared, used.
+
+A model means what it was trained to mean only under the settings that shape it and its labels.
+Where these differ, it is refused; how it was trained may differ.
+"""
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from codetr_ros import checkpoints, rewards, run_folder
+from codetr_ros.checkpoints import CheckpointError
+from codetr_ros.config import Settings, from_canonical
+from codetr_ros.rewards.method import RewardMethod, RewardModelError
+from codetr_ros.rewards.sequence import SequenceMethod
+
+_log = logging.getLogger(__name__)
+
+ROLE = 'reward'
+"""Under which name reward models are saved."""
+_SHARED = ('method', 'target_scale', 'reward_unit')
+_OF_TRAINING = frozenset(
+    [
+        *('batch', 'learning_rate', 'weight_decay', 'dropout', 'warmup_gradient_steps'),
+        *('schedule', 'total_gradient_steps', 'first_gradient_steps', 'gradient_steps'),
+        *('initialisation', 'label_batch', 'state_loss_weight', 'loss', 'subsequences'),
+        'subsequence_steps',
+    ]
+)
+"""Settings of a reward model that neither its weights' shapes nor its labels depend on."""
+
+
+@dataclass(frozen=True)
+class SavedModel:
+    """A reward model as a checkpoint holds it."""
+
+    path: Path
+    tensors: dict[str, torch.Tensor]
+    settings: Settings  # under which it was trained
+    task: str
+    sizes: tuple[int, int]  # of observations and actions
+
+    @property
+    def digest(self) -> str:
+        """`reward_model_sha256` of what is saved."""
+        return checkpoints.digest(self.tensors)
+
+
+def read(path: Path) -> SavedModel:
+    """Read a reward model.
+
+    Args:
+        path: a checkpoint's folder, or that of a fit or of a run: its newest one is taken then.
+
+    Raises:
+        CheckpointError: there is none, or it is damaged.
+        SettingsError: its settings are those of another version.
+    """
+    newest = checkpoints.latest(path / run_folder.CHECKPOINTS, ROLE)
+    chosen = newest or path
+    if newest is None and not (path / checkpoints.DESCRIPTION).is_file():
+        raise CheckpointError(
+            f'{path} is no checkpoint (it has no {checkpoints.DESCRIPTION}), and no folder of a '
+            f'fit or a run with {run_folder.CHECKPOINTS}/{ROLE}-... in it'
+        )
+    tensors, meta = checkpoints.load(chosen)
+    try:
+        settings = from_canonical(meta['settings'], f'checkpoint {chosen}')
+        sizes = int(meta['observation_size']), int(meta['action_size'])
+        task = str(meta['task'])
+    except KeyError as error:
+        raise CheckpointError(
+            f'checkpoint {chosen} does not say {error}: it is none of a reward model'
+        ) from None
+    return SavedModel(chosen, tensors, settings, task, sizes)
+
+
+def restore(
+    saved: SavedModel, settings: Settings, observation_size: int, action_size: int
+) -> RewardMethod:
+    """Make a reward method that goes on where a saved one stopped.
+
+    Args:
+        saved: the saved one.
+        settings: under which it goes on.
+        observation_size: O of what it is to label.
+        action_size: A of what it is to label.
+
+    Raises:
+        RewardModelError: it was trained for another size, method or shape, or has not been
+            trained: names both values.
+    """
+    wrong = [
+        f'{name} = {theirs!r}, here {ours!r}'
+        for name, theirs, ours in (
+            ('observation_size', saved.sizes[0], observation_size),
+            ('action_size', saved.sizes[1], action_size),
+            *_differing(saved.settings, settings),
+        )
+        if theirs != ours
+    ]
+    if wrong:
+        raise RewardModelError(
+            f'checkpoint {saved.path} has {"; ".join(wrong)}: it means something else there. Use '
+            "the checkpoint's settings (its run's or fit's config.yaml), or fit another model"
+        )
+    method = rewards.make(settings, observation_size, action_size)
+    method.load_state(saved.tensors)
+    if not method.target_scale:
+        raise RewardModelError(
+            f'checkpoint {saved.path} was saved before anything was scored: it knows nothing'
+        )
+    for name, theirs, ours in (
+        ('task', saved.task, settings.task),
+        ('composite', saved.settings.composite, settings.composite),
+    ):
+        if theirs != ours:
+            _log.warning(
+                'checkpoint %s is of %s %r, here it is %r: do they mean the same?',
+                saved.path,
+                name,
+                theirs,
+                ours,
+            )
+    return method
+
+
+def _differing(theirs: Settings, ours: Settings) -> list[tuple[str, object, object]]:
+    """Settings that shape a model and its labels, as the two sides have them."""
+    if theirs.method != ours.method:
+        return [('method', theirs.method, ours.method)]
+    kind = rewards.kind(ours)
+    groups = {getattr(kind, 'group', ''), ours.method}
+    mine, saved = ours.flat(), theirs.flat()
+    names = [*_SHARED, *(['delay'] if issubclass(kind, SequenceMethod) else [])]
+    for name in mine:
+        group, _, last = name.rpartition('.')
+        if group and group in groups and last not in _OF_TRAINING:
+            names.append(name)
+    return [(name, saved[name], mine[name]) for name in names]
