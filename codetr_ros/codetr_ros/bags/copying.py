@@ -1,0 +1,156 @@
+"""Messages into a new bag as the bytes that they are, with their times and numbers.
+
+Nothing is decoded, so nothing can change, and types that this library does not know keep the
+definitions that their bag has of them. The new bag is MCAP, whatever the old one was.
+"""
+
+import os
+from collections import Counter
+from collections.abc import Iterable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+from mcap.writer import CompressionType, Writer
+
+from codetr_ros.bags.definitions import bundled_text
+from codetr_ros.bags.errors import BagError
+from codetr_ros.bags.mcap_file import LIBRARY, Channel, RawMessage
+from codetr_ros.bags.metadata import METADATA, BagFile, render
+from codetr_ros.bags.writer import CHUNK_BYTES
+from codetr_ros.run_folder import atomic_write, sync_folder
+
+
+@dataclass(frozen=True)
+class _Topic:
+    """A topic as the old bag describes it."""
+
+    channel: Channel
+
+    @property
+    def name(self) -> str:
+        return self.channel.topic
+
+    @property
+    def type(self) -> str:
+        return self.channel.type
+
+    def digest(self) -> str:
+        return self.channel.definition.digest
+
+    def qos(self) -> list[dict[str, Any]]:
+        try:
+            said = yaml.safe_load(self.channel.qos)
+        except yaml.YAMLError:
+            return []
+        return said if isinstance(said, list) else []
+
+
+@dataclass
+class Copied:
+    """What a new bag holds."""
+
+    files: list[BagFile] = field(default_factory=list)
+    topics: dict[str, _Topic] = field(default_factory=dict)
+    messages: Counter[str] = field(default_factory=Counter)  # by topic
+    bytes: int = 0  # of all messages
+
+
+class _File:
+    """One file of the new bag."""
+
+    def __init__(self, path: Path, library: str) -> None:
+        self.path = path
+        self.about = BagFile(path.name)
+        self._file = path.open('xb')
+        self._writer: Any = Writer(  # its methods carry no types
+            self._file,
+            chunk_size=CHUNK_BYTES,
+            compression=CompressionType.NONE,
+            enable_crcs=True,
+            enable_data_crcs=True,
+        )
+        self._writer.start(profile='ros2', library=library)
+        self._schemas: dict[tuple[str, str, str], int] = {}
+        self._channels: dict[Channel, int] = {}
+
+    def add(self, message: RawMessage) -> None:
+        channel = message.channel
+        number = self._channels.get(channel)
+        if number is None:
+            number = self._channels[channel] = self._describe(channel)
+        self._writer.add_message(
+            number, message.log_time, bytes(message.data), message.publish_time, message.sequence
+        )
+        self.about.add(channel.topic, message.log_time)
+
+    def _describe(self, channel: Channel) -> int:
+        encoding, text, digest = channel.definition
+        if not encoding and (known := bundled_text(channel.type)):
+            encoding, text = 'ros2msg', known
+        key = channel.type, encoding, text
+        if key not in self._schemas:
+            self._schemas[key] = self._writer.register_schema(
+                channel.type, encoding, text.encode()
+            )
+        about = {'offered_qos_profiles': channel.qos}
+        if digest:
+            about['topic_type_hash'] = digest
+        number: int = self._writer.register_channel(
+            channel.topic, channel.encoding, self._schemas[key], about
+        )
+        return number
+
+    def finish(self) -> None:
+        self._writer.finish()
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def copy(messages: Iterable[RawMessage], folder: Path, library: str = LIBRARY) -> Copied:
+    """Write messages to a new bag, one file for each of theirs; `describe` makes it whole.
+
+    Args:
+        messages: in their order.
+        folder: does not exist, or is empty.
+        library: who the files say that they are by, where their own recorder did not number them.
+
+    Raises:
+        BagError: the folder holds something.
+        OSError: it cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if there := sorted(path.name for path in folder.iterdir()):
+        raise BagError(
+            f'{folder} exists and holds {there[0]}: choose another folder, or remove it'
+        )
+    made = Copied()
+    with ExitStack() as stack:
+        file, source = None, None
+        for message in messages:
+            if file is None or message.place.file != source:
+                if file is not None:
+                    file.finish()
+                source = message.place.file
+                name = f'{folder.name}_{len(made.files)}.mcap'
+                file = _File(folder / name, LIBRARY if message.channel.numbered else library)
+                stack.callback(file.close)
+                made.files.append(file.about)
+            file.add(message)
+            made.topics.setdefault(message.channel.topic, _Topic(message.channel))
+            made.messages[message.channel.topic] += 1
+            made.bytes += len(message.data)
+        if file is not None:
+            file.finish()
+            sync_folder(folder)
+    return made
+
+
+def describe(made: Copied, folder: Path) -> None:
+    """Write the metadata of a bag that was copied."""
+    atomic_write(folder / METADATA, render(made.files, made.topics.values()))
