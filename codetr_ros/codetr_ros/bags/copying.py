@@ -112,7 +112,7 @@ class _File:
         self._file.close()
 
 
-def copy(messages: Iterable[RawMessage], folder: Path, library: str = LIBRARY) -> Copied:
+def copy(messages: Iterable[RawMessage], folder: Path, library: str) -> Copied:
     """Write messages to a new bag, one file for each of theirs; `describe` makes it whole.
 
     Args:

@@ -16,6 +16,7 @@ Learn a task from composite delayed rewards, with ROS 2 nodes or in one process.
 commands:
   train      train on a task: starts all nodes, shows progress, ends with a report
   fit        fit a reward model to bags, without any node
+  label      write a bag with a reward model's step rewards added
   evaluate   evaluate the policy of a run's newest checkpoint
   benchmark  many runs under one protocol, and the table that they make
   bag        what is in a bag, is it sound, make it whole again
@@ -36,6 +37,12 @@ def _fit(arguments: Sequence[str]) -> int:
     from codetr_ros.cli import fit
 
     return fit.main(arguments)
+
+
+def _label(arguments: Sequence[str]) -> int:
+    from codetr_ros.cli import label
+
+    return label.main(arguments)
 
 
 def _evaluate(arguments: Sequence[str]) -> int:
@@ -71,6 +78,7 @@ def _doctor(arguments: Sequence[str]) -> int:
 COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     'train': _train,
     'fit': _fit,
+    'label': _label,
     'evaluate': _evaluate,
     'benchmark': _benchmark,
     'bag': _bag,

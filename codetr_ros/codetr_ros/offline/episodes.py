@@ -7,7 +7,7 @@ ends a piece, what is not finite is left out, and all of it is counted.
 
 from array import array
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from hashlib import blake2b
 from typing import Any, NamedTuple
@@ -91,11 +91,13 @@ class Index:
     scores: int = 0
     skipped: Counter[str] = field(default_factory=Counter)
     notes: list[str] = field(default_factory=list)
+    topics: dict[Key, str] = field(default_factory=dict)  # on which their steps came
+    phases: Counter[Key] = field(default_factory=Counter)  # that were begun
     _prints: dict[tuple[str, str, int, bytes], int] = field(default_factory=dict)
     _copies: set[tuple[Key, int]] = field(default_factory=set)
     _said_by: str = ''  # who said the sizes
 
-    def read(self, progress: Callable[[int], None] = lambda steps: None) -> 'Index':
+    def read(self) -> 'Index':
         """Go through the bags once.
 
         Raises:
@@ -113,8 +115,10 @@ class Index:
                 elif isinstance(record, TaskSpec):
                     self._task(number, record)
                 elif isinstance(record, Transitions):
-                    self._take(Key(number, record.run_id, record.source), record)
-                    progress(self.steps)
+                    key = Key(number, record.run_id, record.source)
+                    self.topics.setdefault(key, entry.topic)
+                    self.phases[key] = max(self.phases[key], record.phase + 1)
+                    self._take(key, record)
                 elif isinstance(record, CompositeReward):
                     self._score(Key(number, record.run_id, record.source), record)
         if not self.steps:

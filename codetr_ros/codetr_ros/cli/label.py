@@ -1,0 +1,71 @@
+"""`codetr label`: a bag with step rewards added, as a reward model has them."""
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from codetr_ros.bags.errors import BagError
+from codetr_ros.cli import FAILED, refuse
+from codetr_ros.config import SettingsError
+from codetr_ros.offline.errors import FitError
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Write a bag with the step rewards of all scored segments added, for anybody's use.
+
+    NEW holds every message of BAG byte for byte, and StepRewards messages at its end, on the topic
+    step_rewards beside that of the steps. No ROS is needed.
+    """
+
+    bag: Annotated[
+        str, tyro.conf.Positional, tyro.conf.arg(metavar='BAG', help="a bag, or a run's folder")
+    ]
+    checkpoint: Annotated[
+        str,
+        tyro.conf.arg(
+            metavar='PATH', help='the reward model: folder of a fit, of a run or of a checkpoint'
+        ),
+    ]
+    out: Annotated[str, tyro.conf.arg(metavar='NEW', help='folder of the new bag, new or empty')]
+    memory_steps: Annotated[
+        int, tyro.conf.arg(metavar='N', help='steps that are held in memory at a time')
+    ] = 1_000_000
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Label and say what was labelled; the exit code."""
+    given = tyro.cli(Arguments, prog='codetr label', args=arguments)
+    if given.memory_steps < 1:
+        return refuse(f'--memory-steps {given.memory_steps}: at least 1 step must be held')
+    from codetr_ros.checkpoints import CheckpointError
+    from codetr_ros.offline import labelling, sources
+    from codetr_ros.rewards import RewardModelError, saved
+
+    try:
+        (bag,) = sources.open_bags([Path(given.bag)])
+        model = saved.read(Path(given.checkpoint))
+        made = labelling.label(bag, model, Path(given.out), given.memory_steps)
+    except (BagError, CheckpointError, FitError, SettingsError) as error:
+        return refuse(str(error))
+    except RewardModelError as error:
+        print(f'codetr: {error}', file=sys.stderr)
+        return FAILED
+    console = Console(highlight=False, soft_wrap=True)
+    skipped = ', '.join(f'{n} {name}' for name, n in made.skipped.items() if n)
+    rows = {
+        'labelled': f'{made.segments} segments, {made.steps} steps, on '
+        f'{", ".join(sorted(made.topics)) or "no topic"}',
+        'not labelled': f'{made.unlabelled} steps that no score covers',
+        'skipped': skipped or 'nothing',
+        'copied': f'{made.messages} messages, byte for byte',
+        'output': given.out,
+    }
+    for name, text in rows.items():
+        console.print(f'{name:<16}{text}', markup=False)
+    return 0

@@ -1,0 +1,194 @@
+"""`codetr label`: a bag with the step rewards of all its scored segments, for anybody's use.
+
+The new bag is the old one, message for message and byte for byte, and at its end `StepRewards` of
+every scored segment, in parts, on the topic `step_rewards` beside that of the steps. They are of
+the phase after the bag's last, so that they succeed labels that a run has recorded: of two labels
+of a step the later one holds.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from codetr_ros.bags.copying import copy, describe
+from codetr_ros.bags.definitions import Definition, encode
+from codetr_ros.bags.errors import BagError
+from codetr_ros.bags.mcap_file import LIBRARY, Channel, RawMessage
+from codetr_ros.bags.reader import Bag
+from codetr_ros.bags.topics import BagTopic, schema_text, type_hash
+from codetr_ros.offline.episodes import Index, Key, Stretch, stretches
+from codetr_ros.offline.judging import labels_of
+from codetr_ros.offline.loading import load
+from codetr_ros.received import type_name
+from codetr_ros.records import TOPICS, StepRewards
+from codetr_ros.rewards.core import PART_BYTES
+from codetr_ros.rewards.method import RewardMethod, RewardModelError
+from codetr_ros.rewards.saved import SavedModel, restore
+
+STRETCH_STEPS = 10_000
+"""Longer episodes are labelled in stretches of about so many steps."""
+_DEPTH = 1000
+
+
+@dataclass
+class Labelled:
+    """What came of labelling a bag."""
+
+    messages: int = 0  # of the old bag
+    segments: int = 0
+    steps: int = 0  # that got a label
+    unlabelled: int = 0  # steps that no score covers
+    skipped: Counter[str] = field(default_factory=Counter)
+    topics: set[str] = field(default_factory=set)
+
+
+def label(bag: Bag, saved: SavedModel, folder: Path, memory_steps: int) -> Labelled:
+    """Write a bag with step rewards added.
+
+    Args:
+        bag: the bag; it is not touched.
+        saved: the reward model.
+        folder: the new bag: does not exist, or is empty.
+        memory_steps: steps that are held at a time.
+
+    Raises:
+        BagError: the bag cannot be read, or the new one not be written.
+        FitError: there is nothing to label.
+        RewardModelError: the model is of other sizes, or its labels are not finite.
+    """
+    index = Index([bag]).read()
+    settings = saved.settings
+    method = restore(saved, settings, index.observation_size, index.action_size)
+    found = stretches(index, settings.delay, min(STRETCH_STEPS, max(1, memory_steps // 4)))
+    made = Labelled(unlabelled=found.unscored, skipped=found.skipped)
+    try:
+        messages = _messages(bag, index, method, found.found, memory_steps, made)
+        copied = copy(messages, folder, f'labelled by {LIBRARY}')
+        describe(copied, folder)
+    except OSError as error:
+        raise BagError(
+            f'{folder} cannot be written: {error.strerror}. What it holds is unfinished: remove '
+            'it, make room, and label again'
+        ) from error
+    return made
+
+
+def _messages(
+    bag: Bag,
+    index: Index,
+    method: RewardMethod,
+    found: Sequence[Stretch],
+    memory_steps: int,
+    made: Labelled,
+) -> Iterator[RawMessage]:
+    """All messages of the bag, then those with labels."""
+    channels: dict[str, Channel] = {}
+    counts: Counter[str] = Counter()
+    last: RawMessage | None = None
+    for message in bag.raw():
+        channels[message.channel.topic] = message.channel
+        counts[message.channel.topic] += 1
+        last = message
+        yield message
+    assert last is not None  # the index found steps
+    made.messages = counts.total()
+    for key, parts in _parts(found).items():
+        topic = f'{index.topics[key].rpartition("/")[0]}/{TOPICS[StepRewards]}'
+        channel = channels.setdefault(topic, _channel(topic))
+        if channel.type != type_name(StepRewards):
+            raise BagError(
+                f'{bag.path}: topic {topic} is of type {channel.type}, so labels have no place'
+            )
+        made.topics.add(topic)
+        phase = index.phases[key]
+        for number, record in enumerate(_records(bag, index, method, key, parts, memory_steps)):
+            made.segments += len(record.lengths)
+            made.steps += len(record.labels)
+            part = replace(record, phase=phase, part=number, parts=len(parts))
+            yield RawMessage(
+                channel,
+                last.log_time,
+                last.log_time,
+                counts[topic],
+                encode(part, last.log_time),
+                last.place,
+            )
+            counts[topic] += 1
+
+
+def _channel(topic: str) -> Channel:
+    kind = type_name(StepRewards)
+    definition = Definition('ros2msg', schema_text(kind).decode(), type_hash(kind))
+    qos = yaml.safe_dump(BagTopic(topic, kind, _DEPTH, False).qos(), sort_keys=False)
+    return Channel(topic, kind, 'cdr', definition, qos)
+
+
+def _parts(found: Sequence[Stretch]) -> dict[Key, list[list[Stretch]]]:
+    """Stretches of each source, so many together as one message has room for."""
+    parts: dict[Key, list[list[Stretch]]] = {}
+    sizes: Counter[Key] = Counter()
+    for stretch in found:
+        size = int(stretch.segments.lengths.sum()) * 4 + len(stretch.segments.lengths) * 12
+        mine = parts.setdefault(stretch.key, [])
+        if not mine or sizes[stretch.key] + size > PART_BYTES:
+            mine.append([])
+            sizes[stretch.key] = 0
+        mine[-1].append(stretch)
+        sizes[stretch.key] += size
+    return parts
+
+
+def _records(
+    bag: Bag,
+    index: Index,
+    method: RewardMethod,
+    key: Key,
+    parts: list[list[Stretch]],
+    memory_steps: int,
+) -> Iterator[StepRewards]:
+    """The labels of each part; the bag is read once for as many as the memory has room for."""
+    begin = 0
+    while begin < len(parts):
+        sizes = np.cumsum([sum(s.steps for s in part) for part in parts[begin:]])
+        end = begin + max(1, int(np.searchsorted(sizes, memory_steps, side='right')))
+        yield from _label(bag, index, method, key, parts[begin:end])
+        begin = end
+
+
+def _label(
+    bag: Bag, index: Index, method: RewardMethod, key: Key, parts: list[list[Stretch]]
+) -> Iterator[StepRewards]:
+    wanted = [stretch for part in parts for stretch in part]
+    delay = max(int(s.segments.lengths.max()) for s in wanted)
+    loaded = load([bag], wanted, (index.observation_size, index.action_size), delay)
+    ids = loaded.memory.segment_ids()
+    labels = labels_of(method, loaded, ids)
+    episodes = loaded.memory.segments(ids)[0][1]
+    rows = {id(s): np.flatnonzero(episodes == i) for i, s in enumerate(loaded.stretches)}
+    for part in parts:
+        mine = labels[np.concatenate([rows[id(s)] for s in part])]
+        values = mine[~np.isnan(mine)]
+        lengths = np.concatenate([s.segments.lengths for s in part])
+        if len(values) != lengths.sum() or not np.isfinite(values).all():
+            raise RewardModelError(
+                f'labels of method {method.name!r} are not finite on {bag.path}: what it holds '
+                'is far from what the model was trained on, or training had diverged'
+            )
+        yield StepRewards(
+            key.run_id,
+            0,
+            method.version,
+            0,
+            0,
+            key.source,
+            np.repeat([s.episode for s in part], [len(s.segments.firsts) for s in part]).astype(
+                np.uint32
+            ),
+            np.concatenate([s.segments.firsts for s in part]).astype(np.uint32),
+            lengths.astype(np.uint32),
+            values,
+        )
