@@ -18,8 +18,8 @@ hand:
 
 * There a batch is 64 windows of 500 consecutive steps, which cross episodes and cut bags, a cut
   bag being scored by its share. Here windows are runs of whole segments of one episode: as many as
-  fit into `codetr.window` steps, two at least, and as many windows as make up `codetr.batch`
-  segments (fewer where episodes are shorter than a window).
+  fit into `codetr.window` steps, two at least, that end with a segment drawn uniformly; and as
+  many windows as make up `codetr.batch` segments (fewer where an episode has fewer before it).
 * There the loss on sums is divided by the number of steps, here by that of segments: it does not
   shrink where segments are long.
 * There actions precede states among the tokens, and the next state is predicted from the action's
@@ -74,20 +74,15 @@ class Rbt(SequenceMethod):
         windows = memory.runs(last, self._segments)
         batch = memory.segment_batch(np.concatenate(windows))  # (S, n): S segments of all windows
         row, place = places([len(window) for window in windows])
-
-        def lay(each: Tensor) -> Tensor:
-            """Steps of segments (S, n, ...) side by side in their windows (B, L, ...)."""
-            laid = each.new_zeros(len(windows), int(place.max()) + 1, *each.shape[1:])
-            laid[row, place] = each
-            return laid.flatten(1, 2)
-
-        inside = lay(torch.from_numpy(segment_steps(batch)))  # (B, L)
-        observations = lay(self._standardised(batch.observations[:, :-1]))  # (B, L, O)
-        following = lay(self._standardised(batch.observations[:, 1:]))
-        actions = lay(torch.tensor(batch.actions))
+        inside = side_by_side(torch.from_numpy(segment_steps(batch)), row, place)  # (B, L)
+        before = self._standardised(batch.observations[:, :-1])
+        observations = side_by_side(before, row, place)  # (B, L, O)
+        actions = side_by_side(torch.tensor(batch.actions), row, place)  # (B, L, A)
         rewards, predicted = self.network(observations, actions, inside)  # (B, L), (B, L, O)
-        shape = len(windows), -1, batch.actions.shape[1]
-        sums = rewards.view(shape)[row, place].sum(1)  # (S,)
+        after = self._standardised(batch.observations[:, 1:])
+        following = side_by_side(after, row, place)  # (B, L, O)
+        each = rewards.view(len(windows), -1, batch.actions.shape[1])[row, place]  # (S, n)
+        sums = each.sum(1)  # (S,)
         state_loss = (predicted - following)[inside].square().mean()
         return {
             'reward_loss': (sums - self._scaled(batch.values)).square().mean(),
@@ -103,6 +98,17 @@ def places(sizes: list[int]) -> tuple[Tensor, Tensor]:
     """Of segments in windows of so many: which window each is in, and which of its segments."""
     row = torch.repeat_interleave(torch.tensor(sizes))
     return row, torch.cat([torch.arange(size) for size in sizes])
+
+
+def side_by_side(each: Tensor, row: Tensor, place: Tensor) -> Tensor:
+    """Steps of segments (S, n, ...) in the windows they belong to (B, L, ...), 0 elsewhere.
+
+    All segments but the last of a window are as long as the longest, so that its steps follow on
+    each other and padding lies on the right.
+    """
+    laid = each.new_zeros(int(row[-1]) + 1, int(place.max()) + 1, *each.shape[1:])
+    laid[row, place] = each
+    return laid.flatten(1, 2)
 
 
 class BagTransformer(nn.Module):
