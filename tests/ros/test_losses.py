@@ -18,7 +18,7 @@ from codetr_ros.ros.fetch import unpack
 from codetr_ros.ros.node import CoreNode
 from codetr_ros.ros.patience import Patience
 from codetr_ros.ros.peers import Peers
-from codetr_ros.ros.recording import LastPhases
+from codetr_ros.ros.resend import LastPhases
 from codetr_ros.ros.signals import Stop
 
 

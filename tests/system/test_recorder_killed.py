@@ -79,6 +79,7 @@ MOMENTS: dict[str, Callable[[Listener, Path], bool]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('moment', MOMENTS)
 def test_every_commit_that_was_heard_is_in_the_bag_with_all_that_it_names(tmp_path, moment):
     settings = tiny(steps=ENDLESS, memory_steps=10_000, evaluate_every=0)

@@ -14,6 +14,7 @@ commands:
   info       what is in it: runs, episodes, segments, scores, topics, files
   verify     is it sound? every gap, duplicate, damaged chunk, missing score, by its place
   recover    make a whole bag of what can be read of a damaged or unfinished one
+  play       publish it again, for a reward node or a learner to train from (needs ROS)
 
 `codetr bag COMMAND --help` explains the options of a command.
 """
@@ -37,10 +38,17 @@ def _recover(arguments: Sequence[str]) -> int:
     return bag_recover.main(arguments)
 
 
+def _play(arguments: Sequence[str]) -> int:
+    from codetr_ros.cli import bag_play
+
+    return bag_play.main(arguments)
+
+
 COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     'info': _info,
     'verify': _verify,
     'recover': _recover,
+    'play': _play,
 }
 
 

@@ -98,6 +98,8 @@ class Labeller(Consumer):
         assert method is not None
         if not learns:
             self._phase = phase + 1
+            # said of every phase: who plays a recorded run waits for it
+            yield [self._metrics(phase, {'gradient_steps': method.gradient_steps})]
             return
         if len(memory.segment_ids()) and not self._frozen:
             method.prepare(memory)

@@ -81,15 +81,7 @@ class Joining(Member):
         self.link.subscribe(Presence, self._take)
         self.link.subscribe(RunSpec, self._take)
         if self.role == 'learner':
-            self.settings = parameters.own_settings(self.link.node, self.values['config'])
-            refuse_in_process_only(self.link.full_name, self.settings)
-            tasks.check(self.settings, tasks.find(self.settings.task))
-            if self.folder:
-                refuse_used_folder(self.link.full_name, self.folder, self.settings)
-            run_id = (
-                self.values['run_id'] or f'{time.strftime("%Y%m%d-%H%M%S")}-{secrets.token_hex(2)}'
-            )
-            self.run_spec = self.settings.run_spec(run_id)
+            self._make_run()
         self._tell()
         wanted = f'run {self.values["run_id"]!r}' if self.values['run_id'] else 'a run'
         topic = self.link.node.resolve_topic_name('run')
@@ -106,6 +98,18 @@ class Joining(Member):
             return False
         self._enter()
         return True
+
+    def _make_run(self) -> None:
+        """Decide what run it is, from our parameters."""
+        self.settings = parameters.own_settings(self.link.node, self.values['config'])
+        refuse_in_process_only(self.link.full_name, self.settings)
+        tasks.check(self.settings, tasks.find(self.settings.task))
+        if self.folder:
+            refuse_used_folder(self.link.full_name, self.folder, self.settings)
+        run_id = (
+            self.values['run_id'] or f'{time.strftime("%Y%m%d-%H%M%S")}-{secrets.token_hex(2)}'
+        )
+        self.run_spec = self.settings.run_spec(run_id)
 
     def _owner(self) -> str:
         """The learner whose run it is, for errors: its topics are discovered before its name."""

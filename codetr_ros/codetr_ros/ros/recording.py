@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from codetr_msgs.srv import FetchPhase
 from rclpy.serialization import deserialize_message, serialize_message
 
 from codetr_ros import run_folder
@@ -27,18 +26,16 @@ from codetr_ros.intake import check_run
 from codetr_ros.records import (
     TOPICS,
     Commit,
-    CompositeReward,
     Presence,
     Record,
     RecordError,
     RunSpec,
     StepRewards,
-    Transitions,
 )
 from codetr_ros.ros import messages, qos
-from codetr_ros.ros.fetch import SERVICE
 from codetr_ros.ros.node import CoreNode, MakeCore
 from codetr_ros.ros.peers import published_by
+from codetr_ros.ros.resend import Resender
 from codetr_ros.ros.signals import Stop
 
 NOT_RECORDED = (Presence,)
@@ -78,50 +75,6 @@ class FirstLabels:
         )
 
 
-class LastPhases:
-    """The received bytes of the last committed phases, and of what no commit has named yet."""
-
-    def __init__(self, phases: int) -> None:
-        self._open: dict[tuple[type, str, int], bytes] = {}
-        self._committed: dict[int, list[tuple[type, bytes]]] = {}
-        self._phases = phases
-
-    def hold(self, record: Record, raw: bytes) -> None:
-        """Keep the bytes of a record that the core has taken: a commit will name it."""
-        if isinstance(record, Transitions):
-            self._open[Transitions, record.source, record.sequence] = raw
-        elif isinstance(record, CompositeReward):
-            self._open[CompositeReward, record.scorer, record.sequence] = raw
-
-    def commit(self, commit: Commit, raw: bytes) -> None:
-        """File under the commit's phase what it names; forget the oldest phase."""
-        last = {
-            (Transitions, s): n
-            for s, n in zip(commit.sources, commit.transitions.tolist(), strict=True)
-        }
-        last |= {
-            (CompositeReward, s): n
-            for s, n in zip(commit.scorers, commit.scores.tolist(), strict=True)
-        }
-        named = [key for key in self._open if key[2] <= last.get(key[:2], -1)]
-        self._committed[commit.phase] = [(key[0], self._open.pop(key)) for key in named] + [
-            (Commit, raw)
-        ]
-        while len(self._committed) > self._phases:
-            del self._committed[min(self._committed)]
-
-    def get(self, phase: int) -> list[tuple[type, bytes]]:
-        """Kind and bytes of each message of a committed phase.
-
-        Raises:
-            KeyError: the phase is not held; the message says which ones are.
-        """
-        if phase not in self._committed:
-            held = ', '.join(map(str, sorted(self._committed))) or 'none yet'
-            raise KeyError(f'phase {phase} is not in memory; these are: {held}')
-        return self._committed[phase]
-
-
 class RecordNode(CoreNode):
     """The recorder's core, wired to ROS and to a bag."""
 
@@ -140,7 +93,6 @@ class RecordNode(CoreNode):
         """Open the bag, then subscribe to everything as raw bytes."""
         node = self.link.node
         self._first = FirstLabels(settings) if settings.record_relabels == 'first' else None
-        self._last = LastPhases(settings.lag + 2)
         kinds = [kind for kind in TOPICS if kind not in NOT_RECORDED]
         self._full = {kind: node.resolve_topic_name(TOPICS[kind]) for kind in kinds}
         folder = (
@@ -161,7 +113,8 @@ class RecordNode(CoreNode):
         for kind in kinds:
             if kind not in (RunSpec, Commit):  # the one has come, the other is our own
                 self.link.subscribe(kind, self._take_raw, settings, raw=True)
-        node.create_service(FetchPhase, SERVICE, self._send_again)
+        assert self.run_spec is not None
+        self._last = Resender(self.link, self.run_spec.run_id, settings.lag + 2)
 
     def _bag_topic(self, kind: type, settings: Settings) -> BagTopic:
         topic = TOPICS[kind]
@@ -227,29 +180,6 @@ class RecordNode(CoreNode):
             self._flush_seconds.append(time.perf_counter() - began)
         self._last.commit(record, raw)
         self.link.send(TOPICS[Commit], message)
-
-    def _send_again(
-        self, request: FetchPhase.Request, response: FetchPhase.Response
-    ) -> FetchPhase.Response:
-        own = self.run_spec.run_id if self.run_spec else ''
-        if request.run_id != own:
-            response.reason = (
-                f'this recorder is of run {own!r}, not {request.run_id!r}: ask that of your run'
-            )
-            return response
-        try:
-            found = self._last.get(request.phase)
-        except KeyError as error:
-            response.reason = str(error.args[0])
-            return response
-        self.log.warning(
-            f'{request.requester} lacks something of phase {request.phase}: sending it again'
-        )
-        response.found = True
-        response.types = [messages.type_name(kind) for kind, _ in found]
-        response.lengths = [len(raw) for _, raw in found]
-        response.cdr = b''.join(raw for _, raw in found)
-        return response
 
     def _still_missing(self) -> dict[str, int]:
         told = self.peers.told()

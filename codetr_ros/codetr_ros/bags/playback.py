@@ -1,0 +1,330 @@
+"""What of a bag is published when: in the bag's order, and never ahead of what the run permitted.
+
+In a run the learner permits phase k when it has learnt from phase k - lag, and that bounds what is
+under way. Played back, a phase goes out when everybody who learns from it has said `Metrics` of
+phase k - lag: so nothing overruns them, and they take in and learn the same as in the run, in the
+same order. No ROS needed.
+"""
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from codetr_ros.bags.reader import Bag
+from codetr_ros.config import Settings, SettingsError, from_canonical
+from codetr_ros.records import (
+    TOPICS,
+    Commit,
+    CompositeReward,
+    Metrics,
+    Policy,
+    Record,
+    RunSpec,
+    StepRewards,
+    TaskSpec,
+    Transitions,
+    TrueRewards,
+)
+
+BATCH = 64
+"""Messages that are given out at a time, at most."""
+
+
+class PlayError(RuntimeError):
+    """A bag that cannot be played: names it, the reason and the remedy."""
+
+
+class Item(NamedTuple):
+    """A message to be published."""
+
+    record: Record
+    data: bytes  # as it was recorded
+    log_time: int  # [ns] when it was received
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What a bag has of a run.
+
+    Attributes:
+        run: what it was announced as.
+        settings: its settings.
+        sources: names of its simulators.
+        phases: how many were committed; the run may have been meant to have more.
+    """
+
+    run: RunSpec
+    settings: Settings
+    sources: tuple[str, ...]
+    phases: int
+
+    def cut(self) -> 'Recorded':
+        """The same, announced with as many steps as were committed: who learns from it then
+        finishes with it.
+        """
+        steps = min(self.settings.steps, self.phases * self.settings.phase_steps)
+        if steps == self.settings.steps:
+            return self
+        settings = self.settings.changed({'steps': steps})
+        run = settings.run_spec(self.run.run_id)
+        return Recorded(run, settings, self.sources, self.phases)
+
+
+def survey(bag: Bag, run_id: str | None = None) -> Recorded:
+    """Read through a bag to know what run it holds.
+
+    Args:
+        bag: the bag.
+        run_id: which run, where it holds several.
+
+    Raises:
+        PlayError: it holds no such run, several, or nothing that was committed.
+        BagError: it is damaged.
+    """
+    runs: dict[str, RunSpec] = {}
+    sources: dict[str, set[str]] = {}
+    phases: Counter[str] = Counter()
+    for entry in bag.entries({RunSpec, TaskSpec, Commit}):
+        record = entry.record
+        if isinstance(record, RunSpec):
+            runs[record.run_id] = record
+        elif isinstance(record, TaskSpec):
+            sources.setdefault(record.run_id, set()).add(record.source)
+        elif isinstance(record, Commit):
+            phases[record.run_id] = record.phase + 1
+    wanted = [name for name in runs if run_id in (None, name)]
+    if len(wanted) != 1:
+        there = ', '.join(runs) or 'none'
+        raise PlayError(
+            f'{bag.path} holds {len(wanted)} runs {"" if run_id is None else f"{run_id!r} "}to be '
+            f'played (there are: {there}): choose one with --run, or another bag'
+        )
+    run = runs[wanted[0]]
+    if not phases[run.run_id]:
+        raise PlayError(
+            f'{bag.path}: no phase of run {run.run_id!r} was committed, so that nobody has learnt '
+            'from it: play another bag'
+        )
+    try:
+        settings = from_canonical(run.settings, f'{bag.path}: run {run.run_id!r}')
+    except SettingsError as error:
+        raise PlayError(str(error)) from None
+    names = tuple(sorted(sources.get(run.run_id, ())))
+    return Recorded(run, settings, names, phases[run.run_id])
+
+
+def items(bag: Bag, run_id: str) -> Iterator[Item]:
+    """The messages of a run, in the bag's order; it is announced anew, not played.
+
+    Raises:
+        BagError: the bag is damaged.
+    """
+    for raw in bag.raw():
+        entry = bag.entry(raw)
+        if entry is not None and entry.kind is not RunSpec and entry.record.run_id == run_id:
+            yield Item(entry.record, bytes(raw.data), entry.log_time)
+
+
+def causal(found: Iterable[Item], lag: int) -> Iterator[Item]:
+    """The same messages, where steps never come before the commit that they were permitted after.
+
+    A recorder that hears commits as everybody else does (`ros2 bag record`) may have noted them
+    the other way round.
+    """
+    held: deque[Item] = deque()
+    committed = -1
+
+    def early(item: Item) -> bool:
+        return isinstance(item.record, Transitions) and item.record.phase - lag > committed
+
+    for item in found:
+        if isinstance(item.record, Commit):
+            committed = item.record.phase
+            yield item
+            while held and not early(held[0]):
+                yield held.popleft()
+        elif held or early(item):
+            held.append(item)
+        else:
+            yield item
+    yield from held
+
+
+class Pace:
+    """When messages are due at the pace at which they were recorded.
+
+    Args:
+        rate: how many times as fast.
+        clock: seconds.
+    """
+
+    def __init__(self, rate: float = 1.0, clock: Callable[[], float] = time.monotonic) -> None:
+        self._rate = rate
+        self._clock = clock
+        self._first: tuple[int, float] | None = None
+
+    def due(self, log_time: int) -> bool:
+        """Whether it is time for a message; the first one is due at once."""
+        now = self._clock()
+        if self._first is None:
+            self._first = log_time, now
+        recorded, began = self._first
+        return now - began >= (log_time - recorded) / 1e9 / self._rate
+
+    def restart(self) -> None:
+        """Go on from the next message: somebody had to be waited for."""
+        self._first = None
+
+
+class Playback:
+    """Gives out the messages of a run, in slices, as fast as those who learn from them can follow.
+
+    Args:
+        found: the messages of the run, in the bag's order.
+        phases: how many to play.
+        lag: phases from what is learnt from to what may be under way.
+        learners: roles that are waited for. Where there are any, what belongs to no phase that is
+            played is left out.
+        pace: when a message is due at the earliest; None: at once.
+    """
+
+    subscribes: tuple[type, ...] = (Metrics,)
+
+    def __init__(
+        self,
+        found: Iterable[Item],
+        phases: int,
+        lag: int,
+        learners: Collection[str],
+        pace: Pace | None = None,
+    ) -> None:
+        self._found = causal(found, lag)
+        self._phases = phases
+        self._lag = lag
+        self._pace = pace
+        self._handled = dict.fromkeys(learners, -1)
+        self._due: Counter[tuple[type, str]] = Counter()  # next sequence number of each publisher
+        self._waiting = ''
+        self.phase = -1  # the last whose commit was given out
+        self.counters: Counter[str] = Counter()
+        self.finished = False
+
+    def receive(self, record: Record) -> None:
+        """Take note that a phase was handled."""
+        if isinstance(record, Metrics) and record.role in self._handled:
+            self._handled[record.role] = max(self._handled[record.role], record.phase)
+
+    def work(self) -> Iterator[list[Item] | None]:
+        """A slice is a few messages; None while somebody or the time is waited for.
+
+        Raises:
+            PlayError: something that belongs to a phase is not in the bag.
+        """
+        batch: list[Item] = []
+        for item in self._found:
+            if not self._wanted(item.record):
+                continue
+            while (reason := self._held_back(item)) is not None:
+                if batch:
+                    yield batch
+                    batch = []
+                self._waiting = reason
+                yield None
+            if isinstance(item.record, Commit):
+                self._check(item.record)
+                self.phase = item.record.phase
+            batch.append(item)
+            if len(batch) == BATCH:
+                yield batch
+                batch = []
+        yield batch
+        while late := self._late(self._phases - 1):
+            self._waiting = late
+            yield None
+        self.finished = True
+        while True:
+            yield None
+
+    def _held_back(self, item: Item) -> str | None:
+        """Why a message may not go out yet."""
+        record = item.record
+        if isinstance(record, Transitions) and (late := self._late(record.phase - self._lag)):
+            if self._pace is not None:
+                self._pace.restart()
+            return late
+        if self._pace is not None and not self._pace.due(item.log_time):
+            return 'the time at which the next message was recorded'
+        return None
+
+    def _late(self, phase: int) -> str:
+        late = [role for role, handled in self._handled.items() if handled < phase]
+        return f'{" and ".join(late)}, to have learnt from phase {phase}' if late else ''
+
+    def _wanted(self, record: Record) -> bool:
+        """Whether a record is to be played: not twice, and not what no commit names."""
+        topic = TOPICS[type(record)]
+        if self._handled and self._surplus(record):
+            self.counters[f'{topic} of no phase that is played'] += 1
+            return False
+        if not isinstance(record, (Transitions, CompositeReward)):
+            return True
+        name = record.source if isinstance(record, Transitions) else record.scorer
+        key = (type(record), name)
+        if record.sequence < self._due[key]:
+            self.counters[f'{topic} recorded twice'] += 1
+            return False
+        if record.sequence > self._due[key]:
+            self._lacks(key, record.sequence - 1)
+        self._due[key] += 1
+        if isinstance(record, Transitions):
+            self.counters['steps'] += record.steps
+        return True
+
+    def _surplus(self, record: Record) -> bool:
+        if isinstance(record, Policy) and not record.steps.any():
+            return False  # it says that all phases have been permitted
+        if isinstance(record, (Policy, Transitions, TrueRewards, Commit, StepRewards)):
+            return record.phase >= self._phases
+        # it says of no phase that it belongs to it: the commit does
+        return isinstance(record, CompositeReward) and self.phase == self._phases - 1
+
+    def _check(self, commit: Commit) -> None:
+        """Refuse a commit of which something has not been played."""
+        for key, number in _named(commit).items():
+            if number >= self._due[key]:
+                self._lacks(key, number)
+
+    def _lacks(self, key: tuple[type, str], last: int) -> None:
+        raise PlayError(
+            f'{TOPICS[key[0]]} {self._due[key]} to {last} of {key[1]!r} are not in the bag, after '
+            f'phase {self.phase} was played: `codetr bag verify` says what else is missing'
+        )
+
+    def done(self, role: str) -> bool:
+        """Whether a role has learnt from everything that is played, as far as it is waited for."""
+        return self._handled.get(role, self._phases) >= self._phases - 1
+
+    def waiting_for(self) -> str:
+        """What the next message waits for, for people."""
+        return self._waiting
+
+    def close(self) -> None:
+        """Nothing to save."""
+
+    def report(self) -> dict[str, Any]:
+        """Counts for people."""
+        return {'counters': dict(self.counters), 'phases': self.phase + 1}
+
+
+def _named(commit: Commit) -> dict[tuple[type, str], int]:
+    """The last sequence number of each publisher that a commit names."""
+    return {
+        (kind, name): number
+        for kind, names, last in (
+            (Transitions, commit.sources, commit.transitions),
+            (CompositeReward, commit.scorers, commit.scores),
+        )
+        for name, number in zip(names, last.tolist(), strict=True)
+    }

@@ -1,0 +1,104 @@
+"""`codetr bag play`: a recorded run, published again for nodes that learn from it."""
+
+import dataclasses
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from codetr_ros import middleware, run_folder
+from codetr_ros.cli import refuse
+
+DEFAULT_NAMESPACE = '/play'
+
+
+def _option(said: str, metavar: str | None = None) -> object:
+    return tyro.conf.arg(help=said, metavar=metavar)
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Publish a recorded run again, for a reward node or a learner to train from, or to be looked
+    at. The nodes that it is played to are started by you, in the namespace:
+
+        ros2 run reward_node reward --ros-args -r __ns:=/play -p folder:=/tmp/played
+
+    All other roles of the run are played. It ends when everything has been learnt from.
+    """
+
+    bag: Annotated[
+        str,
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar='BAG', help="the bag's folder or file, or the folder of a run"),
+    ]
+    to: Annotated[
+        tuple[Literal['reward', 'learner', 'evaluate', 'nobody'], ...],
+        _option('nodes that are there themselves; nobody: play to whoever listens'),
+    ] = ('reward',)
+    pace: Annotated[
+        Literal['commits', 'recorded'],
+        _option('a phase as soon as the one before has been learnt from, or as it was recorded'),
+    ] = 'commits'
+    rate: Annotated[
+        float | None, _option('times as fast as it was recorded; implies --pace recorded', 'R')
+    ] = None
+    namespace: Annotated[str, _option('where to publish')] = DEFAULT_NAMESPACE
+    run: Annotated[str | None, _option('which run, where the bag holds several', 'ID')] = None
+    deadline: Annotated[
+        float, _option('seconds to wait for nodes that are missing or silent; 0: for ever', 'S')
+    ] = 60.0
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Play a bag; the exit code."""
+    given = tyro.cli(
+        Arguments, prog='codetr bag play', args=arguments, config=(tyro.conf.FlagCreatePairsOff,)
+    )
+    live = tuple(role for role in given.to if role != 'nobody')
+    recorded_pace = given.pace == 'recorded' or given.rate is not None
+    if given.rate is not None and not given.rate > 0:
+        return refuse(f'--rate {given.rate:g} must be greater than 0')
+    if not 0 <= given.deadline <= 86_400:
+        return refuse(f'--deadline {given.deadline:g} must be from 0 to 86400')
+    if live != given.to and live:
+        return refuse(f'--to {" ".join(given.to)}: either nobody, or nodes')
+    if 'evaluate' in live and 'learner' not in live:
+        return refuse('--to evaluate: an evaluator follows a learner: play to the learner too')
+    if not live and not recorded_pace:
+        return refuse('--to nobody needs --pace recorded or --rate: nobody says when to go on')
+
+    from codetr_ros.bags.errors import BagError
+    from codetr_ros.bags.playback import Pace, PlayError, items, survey
+    from codetr_ros.bags.reader import Bag
+
+    try:
+        bag = Bag(_bag(Path(given.bag)))
+        recorded = survey(bag, given.run)
+    except (BagError, PlayError) as error:
+        return refuse(str(error))
+    try:
+        from codetr_ros.ros import player
+    except ImportError as error:
+        return refuse(
+            f'playing needs ROS, which cannot be imported ({error}): `codetr doctor` says what is '
+            'missing; `codetr fit` learns from bags without it'
+        )
+    for variable, value in middleware.DEFAULTS.items():
+        os.environ.setdefault(variable, value)
+    code: int = player.play(
+        recorded,
+        lambda: items(bag, recorded.run.run_id),
+        live,
+        Pace(given.rate or 1.0) if recorded_pace else None,
+        given.namespace,
+        given.deadline,
+    )
+    return code
+
+
+def _bag(path: Path) -> Path:
+    """The bag of a run, where the folder of the run is given."""
+    inside = path / run_folder.BAG
+    return inside if (path / run_folder.CONFIG).is_file() and inside.is_dir() else path

@@ -1,0 +1,91 @@
+"""Sends a committed phase again, to a node that has not got all of it."""
+
+from codetr_msgs.srv import FetchPhase
+
+from codetr_ros.records import Commit, CompositeReward, Record, Transitions
+from codetr_ros.ros import messages
+from codetr_ros.ros.fetch import SERVICE
+from codetr_ros.ros.link import Link
+
+
+class LastPhases:
+    """The received bytes of the last committed phases, and of what no commit has named yet."""
+
+    def __init__(self, phases: int) -> None:
+        self._open: dict[tuple[type, str, int], bytes] = {}
+        self._committed: dict[int, list[tuple[type, bytes]]] = {}
+        self._phases = phases
+
+    def hold(self, record: Record, raw: bytes) -> None:
+        """Keep the bytes of a record that the core has taken: a commit will name it."""
+        if isinstance(record, Transitions):
+            self._open[Transitions, record.source, record.sequence] = raw
+        elif isinstance(record, CompositeReward):
+            self._open[CompositeReward, record.scorer, record.sequence] = raw
+
+    def commit(self, commit: Commit, raw: bytes) -> None:
+        """File under the commit's phase what it names; forget the oldest phase."""
+        last = {
+            (Transitions, s): n
+            for s, n in zip(commit.sources, commit.transitions.tolist(), strict=True)
+        }
+        last |= {
+            (CompositeReward, s): n
+            for s, n in zip(commit.scorers, commit.scores.tolist(), strict=True)
+        }
+        named = [key for key in self._open if key[2] <= last.get(key[:2], -1)]
+        self._committed[commit.phase] = [(key[0], self._open.pop(key)) for key in named] + [
+            (Commit, raw)
+        ]
+        while len(self._committed) > self._phases:
+            del self._committed[min(self._committed)]
+
+    def get(self, phase: int) -> list[tuple[type, bytes]]:
+        """Kind and bytes of each message of a committed phase.
+
+        Raises:
+            KeyError: the phase is not held; the message says which ones are.
+        """
+        if phase not in self._committed:
+            held = ', '.join(map(str, sorted(self._committed))) or 'none yet'
+            raise KeyError(f'phase {phase} is not in memory; these are: {held}')
+        return self._committed[phase]
+
+
+class Resender(LastPhases):
+    """The last phases, and the service `fetch_phase` that sends one of them.
+
+    Args:
+        link: the node's connection.
+        run_id: the run.
+        phases: how many to hold.
+    """
+
+    def __init__(self, link: Link, run_id: str, phases: int) -> None:
+        super().__init__(phases)
+        self._log = link.node.get_logger()
+        self._run_id = run_id
+        link.node.create_service(FetchPhase, SERVICE, self._send)
+
+    def _send(
+        self, request: FetchPhase.Request, response: FetchPhase.Response
+    ) -> FetchPhase.Response:
+        if request.run_id != self._run_id:
+            response.reason = (
+                f'this recorder is of run {self._run_id!r}, not {request.run_id!r}: ask that of '
+                f'your run'
+            )
+            return response
+        try:
+            found = self.get(request.phase)
+        except KeyError as error:
+            response.reason = str(error.args[0])
+            return response
+        self._log.warning(
+            f'{request.requester} lacks something of phase {request.phase}: sending it again'
+        )
+        response.found = True
+        response.types = [messages.type_name(kind) for kind, _ in found]
+        response.lengths = [len(raw) for _, raw in found]
+        response.cdr = b''.join(raw for _, raw in found)
+        return response

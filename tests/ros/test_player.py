@@ -1,0 +1,128 @@
+"""The player among real nodes that it waits for, or whose trouble it sees."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from bags.making import SETTINGS, a_run, ours, topic_of
+from builders import run, same
+from ros.playing import NAMESPACE, output, process
+
+from codetr_ros import run_folder
+from codetr_ros.bags.definitions import encode
+from codetr_ros.bags.topics import BagTopic
+from codetr_ros.bags.writer import McapWriter
+from codetr_ros.received import type_name
+from codetr_ros.records import TOPICS, Commit, CompositeReward, RunSpec, Transitions
+from codetr_ros.ros import messages
+from codetr_ros.ros.link import Link
+
+
+def uniform(phases=3):
+    """A run whose reward node has next to nothing to do."""
+    settings = SETTINGS.changed({'method': 'uniform', 'evaluate_every': 0})
+    return [run(settings), *a_run(phases)[1:]]
+
+
+@contextmanager
+def player(bag: Path, *flags: str):
+    node = subprocess.Popen(
+        [sys.executable, '-m', 'codetr_ros.cli', 'bag', 'play', bag, '--namespace', NAMESPACE,
+         *flags],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=os.environ,
+    )  # fmt: skip
+    try:
+        yield node
+    finally:
+        if node.poll() is None:
+            node.kill()
+        node.communicate()
+
+
+def test_who_is_missing_is_named_with_what_starts_it(ros_domain, tmp_path):
+    with player(ours(tmp_path / 'bag', uniform()), '--deadline', '1') as node:
+        said = output(node)
+    assert node.returncode == 1
+    assert (
+        'gave up after 1 s: it waits for reward (start it with `ros2 run reward_node reward` in '
+        'this namespace)' in said
+    )
+    assert 'Traceback' not in said
+
+
+def test_a_phase_that_a_node_lacks_is_sent_again(ros_domain, tmp_path):
+    bag = ours(tmp_path / 'bag', uniform(phases=1))
+    with process('deaf', f'folder:={tmp_path}') as deaf, player(bag) as node:
+        said, heard = output(node), output(deaf)
+    assert (node.returncode, deaf.returncode) == (0, 0), said + heard
+    report = run_folder.read_report(run_folder.report_path(tmp_path, 'reward', 'reward'))
+    assert report['fetched'] == {'transitions': 4}
+    assert '/r/reward lacks something of phase 0: sending it again' in said
+
+
+def test_a_node_that_stops_amid_the_bag_is_named(ros_domain, tmp_path):
+    bag = ours(tmp_path / 'bag', uniform())
+    with process('deaf') as deaf, player(bag) as node:
+        for line in node.stdout:
+            if 'phase 0 is played' in line:
+                break
+        deaf.send_signal(signal.SIGINT)
+        said = output(node)
+    assert node.returncode == 1
+    assert 'reward /r/reward stopped before everything was played: it waits for reward, to' in said
+
+
+def test_a_learner_of_another_run_is_refused_naming_both_values(ros_domain, tmp_path):
+    bag = ours(tmp_path / 'bag', uniform())
+    with (
+        process('learner', 'delay:=6', 'steps:=60', 'phase_steps:=20') as learner,
+        player(bag, '--to', 'learner') as node,
+    ):
+        said = output(node)
+        learner.kill()
+    assert node.returncode == 1
+    assert 'the recorded run has task =' in said or 'the recorded run has delay = 5' in said
+    assert 'start the learner with' in said
+
+
+@pytest.fixture
+def listener(play):
+    """Somebody who is no part of the run, and what he hears."""
+    play(roles=())
+    link = Link('listener')
+    link.heard = []
+    for kind in (RunSpec, Transitions, CompositeReward, Commit):
+        link.subscribe(kind, lambda kind, m: link.heard.append(messages.from_message(m)))
+    yield link
+    link.close()
+
+
+def test_to_nobody_a_bag_goes_out_at_the_pace_at_which_it_was_recorded(listener, tmp_path):
+    records = uniform()
+    # steps begin when everybody has long discovered the topics
+    times = [0, 1, *(8_000_000_000 + 10_000_000 * i for i in range(len(records) - 2))]
+    topics = [BagTopic(topic_of(r), type_name(type(r)), 10, False) for r in records]
+    writer = McapWriter(tmp_path / 'bag', topics)
+    for record, when in zip(records, times, strict=True):
+        writer.write(topic_of(record), encode(record, 0), when)
+    writer.close()
+    with player(tmp_path / 'bag', '--to', 'nobody', '--rate', '2') as node:
+        began = None
+        while node.poll() is None:
+            listener.drain(0.05)
+            while listener.inbox:
+                listener.inbox.popleft()()
+                began = began or time.monotonic()
+        seconds = time.monotonic() - began
+        said = output(node)
+    assert node.returncode == 0, said
+    for kind in (RunSpec, Transitions, CompositeReward, Commit):
+        sent = [r for r in records if isinstance(r, kind)]
+        got = [r for r in listener.heard if isinstance(r, kind)]
+        assert len(sent) == len(got) and all(map(same, sent, got)), TOPICS[kind]
+    assert seconds > 4.0
