@@ -262,6 +262,26 @@ class LearnedContract(Contract):
             torch.testing.assert_close(parameter, kept, rtol=0, atol=0, equal_nan=True)
 
 
+class PerceptronContract(LearnedContract):
+    """A network whose inputs nothing bounds but the method itself."""
+
+    def test_an_observation_far_from_those_of_the_warm_up_does_not_blow_rewards_up(self):
+        memory = filled()
+        made = self.trained(memory)
+        batch = batch_of(memory, made)
+        mean, std = memory.observation_moments()
+        far = []
+        for deviations in (11, 1000):
+            batch.observations[0, 2] = mean + deviations * std
+            far.append(made.label(batch))
+        np.testing.assert_array_equal(*far)
+        bare = self.trained(memory, **{f'{self.method}__normalise_observations': False})
+        batch.observations[0, 2] = 11
+        near = bare.label(batch)
+        batch.observations[0, 2] = 1000
+        assert (bare.label(batch)[0, 2] != near[0, 2]).all()
+
+
 class TestCodetr(LearnedContract):
     method = 'codetr'
 
@@ -315,7 +335,7 @@ class TestRbtOfSegments(TestRbt):
     }
 
 
-class TestRrd(LearnedContract):
+class TestRrd(PerceptronContract):
     method = 'rrd'
 
 
@@ -323,7 +343,7 @@ class TestRrdUnbiased(TestRrd):
     changes: ClassVar[dict[str, Any]] = {'rrd__loss': 'unbiased'}
 
 
-class TestMlp(LearnedContract):
+class TestMlp(PerceptronContract):
     method = 'mlp'
 
 

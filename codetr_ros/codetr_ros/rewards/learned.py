@@ -40,6 +40,11 @@ class Learned(RewardMethod):
 
     group: ClassVar[str]
     """The group of settings that it is trained by."""
+    clip: ClassVar[float] = math.inf
+    """Deviations from the mean beyond which standardised observations are cut off.
+
+    For networks that do not normalise their inputs themselves, as the transformer does.
+    """
 
     def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
         super().__init__(settings, observation_size, action_size)
@@ -145,7 +150,10 @@ class Learned(RewardMethod):
 
     def _standardised(self, observations: F32) -> Tensor:
         # torch.tensor copies into aligned memory: nothing may depend on where numpy's is
-        return (torch.tensor(observations) - self._mean) / self._std
+        standardised = (torch.tensor(observations) - self._mean) / self._std
+        if self._own.normalise_observations:
+            return standardised.clamp(-self.clip, self.clip)
+        return standardised
 
     def _scaled(self, values: F64) -> Tensor:
         """Composite rewards (B,) in units of c."""

@@ -19,12 +19,19 @@ from codetr_ros.rewards.learned import Learned
 from codetr_ros.rewards.method import segment_steps
 from codetr_ros.trajectories import SegmentBatch, Trajectories
 
+CLIP = 10.0
+"""Deviations at which a perceptron's standardised observations are cut off (decided here).
+
+A component that hardly moved in the warm-up may lie a thousand of its deviations away later.
+"""
+
 
 class Mlp(Learned):
     """Learns R(segment) = sum_t r(s_t, a_t) by regression; labels steps with r(s_t, a_t)."""
 
     name: ClassVar[str] = 'mlp'
     group: ClassVar[str] = 'mlp'
+    clip: ClassVar[float] = CLIP
 
     def _make_network(self, observation_size: int, action_size: int) -> nn.Module:
         return perceptron(observation_size + action_size, self._settings.mlp.hidden)

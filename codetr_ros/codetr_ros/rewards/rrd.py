@@ -18,7 +18,7 @@ What differs from the published code:
   are computed as they are sampled. Here gradient steps come per phase, by default as many as a
   phase has steps, and the learner meets labels of the phase's last net.
 * R in units of the target scale c and standardised observations, as all methods here; neither is
-  there. The difference s - s' is taken of the standardised ones.
+  there. The difference s - s' is taken of the standardised ones, cut off at 10 deviations.
 * The learner is the SAC of all methods here.
 
 The published code has the network (input s, a, s - s'; Xavier weights), the learning rate, four
@@ -35,7 +35,7 @@ from torch import Tensor, nn
 
 from codetr_ros.records import I64
 from codetr_ros.rewards.learned import Learned
-from codetr_ros.rewards.mlp import perceptron
+from codetr_ros.rewards.mlp import CLIP, perceptron
 from codetr_ros.trajectories import SegmentBatch, Trajectories
 
 
@@ -50,6 +50,7 @@ class Rrd(Learned):
 
     name: ClassVar[str] = 'rrd'
     group: ClassVar[str] = 'rrd'
+    clip: ClassVar[float] = CLIP
 
     def _make_network(self, observation_size: int, action_size: int) -> nn.Module:
         return perceptron(2 * observation_size + action_size, self._settings.rrd.hidden)
