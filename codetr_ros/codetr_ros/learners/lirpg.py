@@ -12,23 +12,30 @@ On-policy, with a gradient through the policy: it runs in process and in lock-st
 from each phase's steps once the phase is over, and forgets them. Nothing labels steps and there is
 no reward node; R is a segment's composite reward at its last step and 0 elsewhere.
 
-The structure and the constants are those of the authors' published code, as read. The hand-written
-Adam takes its second moment as a constant, as theirs. What differs, on purpose:
+How certain this is: structure and constants are those of the authors' published code, as it was
+read; so is an Adam by hand whose second moment is a constant to the meta-gradient. What is marked
+(recalled) was not looked up again. That the comparison in the CoDeTr paper used that code, with
+its delay of rewards set to n, is inferred. What differs, on purpose:
 
 - A phase (`phase_steps`, 1000) takes the place of 2048 steps; `lirpg.batch` is their size of a
   minibatch, 64, where they have a number of minibatches, 32.
 - Actions are tanh(u) of a Gaussian u, as for every policy here, where theirs are Gaussian and
-  clipped by the environment. Losses are those of u, which the action gives back: what tanh does to
-  the density cancels in PPO's ratio.
+  clipped by the environment (recalled). Losses are those of u, which the action gives back: what
+  tanh does to the density cancels in PPO's ratio.
 - Composite rewards are made of raw rewards and then divided by the running deviation of their
   discounted return, where theirs are scaled first and summed up then: a composite is not linear.
   `target_scale` and `reward_unit` do not matter. The running return begins anew with each phase.
 - Moments of the observations change between phases, not between steps, so that a phase has one
   policy. They begin with the warm-up's random steps, from which nothing else is learnt.
 - At the time limit values are bootstrapped, as everywhere here; theirs are not (recalled).
-- The value loss is a plain squared error (half of it, times `value_coefficient`), not clipped, and
-  there is no bonus for entropy (their coefficient is 0). The form of Adam's step size and where
-  its epsilon stands are torch's.
+- The value loss is a plain squared error (half of it, times `value_coefficient`), where theirs is
+  clipped (recalled); there is no bonus for entropy (their coefficient is 0). The form of Adam's
+  step size and where its epsilon stands are torch's.
+
+Decided here, where nothing was known: both objectives normalise advantages by minibatch; the norm
+of gradients is bounded for each of the two updates by itself, policy with value and intrinsic
+reward with value of R, and the meta-gradient goes through that bound and through the
+normalisation; eta and theta move together after each minibatch.
 
 Shapes: T = steps of the phase, B = steps of a minibatch, O, A = sizes of observation and action.
 """
