@@ -101,10 +101,7 @@ def _run(given: Run) -> int:
         except spec.BenchmarkError as error:
             return refuse(str(error))
     if interrupts.count:
-        print(
-            f'stopped: what has ended is kept; the same command goes on (codetr benchmark run '
-            f'{given.spec} --out {given.out})'
-        )
+        print('stopped: what has ended is kept; the same command goes on')
         return INTERRUPTED
     if failed:
         print(f'{len(failed)} cells have failed:')
