@@ -75,7 +75,7 @@ def _pictures(results: Sequence[Result], anchors: trivial.Anchors) -> Iterator[t
         name = some[0].cell.split(f'_{some[0].method}_seed')[0]
         seeds = len({result.seed for result in some if result.summary})
         task, composite, delay = key
-        title = f'{task}: {composite} of {delay} steps; mean and range of up to {seeds} seeds'
+        title = f'{task}: {composite} of {delay} steps; mean and range over seeds ({seeds})'
         yield f'learning_{name}.png', curves.learning_curves(some, order, numbers, title)
         picture = curves.recovery_curves(some, order, f'Reward recovery. {title}')
         if picture is not None:
