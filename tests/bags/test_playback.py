@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bags.making import SETTINGS, a_run, ours
-from builders import run
+from bags.making import SETTINGS, WRITERS, a_run, ours
+from builders import run, same
 
 from codetr_ros.bags.playback import Item, Pace, Playback, PlayError, causal, items, survey
 from codetr_ros.bags.reader import Bag
@@ -214,6 +214,15 @@ def test_a_survey_says_what_run_a_bag_holds(tmp_path):
     data = [item.data for item in items(bag, 'run')]
     assert data == [bytes(raw.data) for raw in bag.raw()][1:]  # all but the announcement
     assert list(items(bag, 'another')) == []
+
+
+@pytest.mark.parametrize('writer', WRITERS)
+def test_bags_that_others_wrote_are_played_too(tmp_path, writer):
+    records = a_run()
+    bag = Bag(WRITERS[writer](tmp_path / 'bag', records))
+    assert survey(bag).phases == 3
+    found = [item.record for item in items(bag, 'run')]
+    assert len(found) == len(records) - 1 and all(map(same, found, records[1:]))
 
 
 def test_a_run_that_was_stopped_is_announced_with_the_steps_that_were_committed(tmp_path):

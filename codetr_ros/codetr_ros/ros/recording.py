@@ -229,5 +229,6 @@ class RecordNode(CoreNode):
             'recorded': dict(self._recorded),
             'bag': str(self._bag.folder) if self._bag else None,
             'bag_bytes': self._bag.size if self._bag else 0,
+            'flush_seconds': sum(self._flush_seconds),
             'flush_ms': {'median': 1e3 * flushes[len(flushes) // 2], 'max': 1e3 * flushes[-1]},
         }
