@@ -17,6 +17,7 @@ MODULES = {
     'record': 'codetr_ros.ros.record',
     'sim': 'sim_node.sim',
     'learner': 'learner_node.learner',
+    'reward': 'reward_node.reward',
     'deaf': 'deaf.py',
 }
 NAMESPACE = '/r'

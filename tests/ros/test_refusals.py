@@ -53,6 +53,17 @@ def test_other_nodes_refuse_the_run_of_such_a_method_before_they_open_a_topic(pl
     assert {said.settings_hash for said in play.presence_of('record')} == {''}  # no core either
 
 
+def test_a_reward_node_refuses_a_run_whose_learner_takes_the_scores_itself(play):
+    play = play(settings=tiny(method='hc'))
+    with process('reward') as node:
+        play.until(lambda: node.poll() is not None)
+        said = output(node)
+    assert node.returncode == 1
+    assert "/r/reward: method = 'hc' learns from the scores in the learner" in said
+    assert 'stop this one, or start the learner with another method' in said
+    assert 'Traceback' not in said
+
+
 def test_a_learner_refuses_a_task_that_does_not_exist_at_once(ros_domain):
     assert "there is no task 'Antt-v4' (close: Ant-v4" in refusal('task:=Antt-v4')
 
