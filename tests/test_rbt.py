@@ -107,6 +107,12 @@ def test_a_window_lets_labels_depend_on_the_steps_before_the_segment():
     after = rbt.label(replace(batch, actions=actions))
     inside = segment_steps(batch)[row]
     assert (np.abs(after[row] - before[row])[inside] > 1e-7).all()
+    # ... by their attention too: that of a window without segments gives the same
+    seen = (torch.from_numpy(batch.observations[row : row + 1, :-1]) - rbt._mean) / rbt._std
+    everything = torch.ones(1, 14, dtype=torch.bool)
+    with torch.inference_mode():
+        z, _ = rbt.network(seen, torch.from_numpy(batch.actions[row : row + 1]), everything)
+    np.testing.assert_allclose(before[row, 7:], z[0, 7:], rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize(('scope', 'segments'), [('segment', 1), ('window', 3)])

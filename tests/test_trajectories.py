@@ -332,3 +332,18 @@ def test_runs_are_whole_scored_segments_of_one_episode_that_end_with_the_given_o
     assert all(
         names[int(n)][:2] == name[:2] for run, name in zip(runs, asked, strict=True) for n in run
     )
+
+
+def test_a_run_ends_where_the_segment_before_is_cut_short():
+    memory = Trajectories(OBSERVATION, ACTION, 5, 1000, 100, regular=False)
+    memory.append(
+        builders.transitions(
+            steps=20,
+            observations=np.zeros((21, OBSERVATION), np.float32),
+            actions=np.zeros((20, ACTION), np.float32),
+        )
+    )
+    for first, length in ((0, 5), (5, 3), (10, 5), (15, 2)):
+        memory.score(builders.score(first_step=first, length=length))
+    ids = memory.segment_ids()
+    assert [len(run) for run in memory.runs(ids, 4)] == [1, 2, 1, 2]
