@@ -17,6 +17,7 @@ commands:
   train      train on a task: starts all nodes, shows progress, ends with a report
   fit        fit a reward model to bags, without any node
   label      write a bag with a reward model's step rewards added
+  convert    make a bag to fit of ordinary topics, by a mapping file
   evaluate   evaluate the policy of a run's newest checkpoint
   benchmark  many runs under one protocol, and the table that they make
   bag        what is in a bag, is it sound, make it whole again
@@ -43,6 +44,12 @@ def _label(arguments: Sequence[str]) -> int:
     from codetr_ros.cli import label
 
     return label.main(arguments)
+
+
+def _convert(arguments: Sequence[str]) -> int:
+    from codetr_ros.cli import convert
+
+    return convert.main(arguments)
 
 
 def _evaluate(arguments: Sequence[str]) -> int:
@@ -79,6 +86,7 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     'train': _train,
     'fit': _fit,
     'label': _label,
+    'convert': _convert,
     'evaluate': _evaluate,
     'benchmark': _benchmark,
     'bag': _bag,

@@ -1,0 +1,58 @@
+"""`codetr convert`: a bag that can be fitted, of a bag with ordinary topics."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from codetr_ros.bags.errors import BagError
+from codetr_ros.cli import refuse
+from codetr_ros.config import SettingsError
+from codetr_ros.offline.errors import FitError
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Make Transitions and CompositeReward messages of ordinary topics, by a mapping file.
+
+    The mapping says which fields of which topics are observation, action and score, when a step is
+    taken and where an episode ends: docs/other-peoples-data.md. No ROS is needed.
+    """
+
+    bag: Annotated[
+        str, tyro.conf.Positional, tyro.conf.arg(metavar='BAG', help="MCAP or SQLite, anybody's")
+    ]
+    mapping: Annotated[str, tyro.conf.arg(metavar='FILE', help='the mapping, a YAML file')]
+    out: Annotated[str, tyro.conf.arg(metavar='NEW', help='folder of the new bag, new or empty')]
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Convert and say what came of it; the exit code."""
+    given = tyro.cli(Arguments, prog='codetr convert', args=arguments)
+    from codetr_ros.bags.reader import Bag
+    from codetr_ros.offline import mapping
+    from codetr_ros.offline.converted_bag import convert
+
+    try:
+        rules = mapping.load(Path(given.mapping))
+        made = convert(Bag(Path(given.bag)), rules, Path(given.out))
+    except (BagError, FitError, SettingsError) as error:
+        return refuse(str(error))
+    read = ', '.join(f'{n} of {topic}' for topic, n in sorted(made.messages.items()))
+    lost = ', '.join(f'{n} {what}' for what, n in made.dropped.items())
+    rows = {
+        'messages': read,
+        'sizes': f'{made.sizes[0]} observations, {made.sizes[1]} actions',
+        'episodes': f'{made.episodes}, {made.steps} steps of '
+        f'{made.shortest:.3g} to {made.longest:.3g} s',
+        'scores': f'{made.scores}, of {made.scored_steps} steps together',
+        'dropped': lost or 'nothing',
+        'output': given.out,
+    }
+    console = Console(highlight=False, soft_wrap=True)
+    for name, text in rows.items():
+        console.print(f'{name:<12}{text}', markup=False)
+    return 0

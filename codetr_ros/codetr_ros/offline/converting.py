@@ -1,0 +1,345 @@
+"""Ordinary topics into steps and scores, message by message, as a mapping says.
+
+The rules of time, where `now` is when a message was received (its log time):
+
+* What was last received holds (zero-order hold), at most `max_age` seconds for observations.
+* A step begins with each command, or at a fixed rate from an episode's first command on. Its
+  observation is what holds at its begin, its action the command that holds then; its next
+  observation is what holds at the begin of the next step.
+* An episode ends where the episode topic says so, where no command comes for `gap` seconds, and
+  where a step has no observation that is young and finite: there is no step across a hole.
+* The next observation of an episode's last step is what holds at its end, or as long after its
+  begin as the step before took, where that is earlier. If nothing was observed in between, the
+  step is dropped.
+* A score is of steps that began before it or with it. It belongs to the episode that is going on,
+  or has ended while no new one has begun. One of all steps since the last score is of one less
+  where the last step was dropped.
+
+Whatever is dropped is counted.
+"""
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from codetr_ros.bags.reader import Message
+from codetr_ros.offline import mapping
+from codetr_ros.offline.errors import FitError
+from codetr_ros.offline.mapping import Mapping
+from codetr_ros.records import F32, F64, CompositeReward, Transitions
+
+CHUNK_BYTES = 200_000
+"""Size at which steps are written; an episode's last chunk says that it has ended."""
+NS = 10**9
+
+NO_OBSERVATION = 'samples without an observation within max_age'
+NOT_FINITE = 'samples that are not finite'
+NO_NEXT = 'last steps of episodes without an observation after them'
+CLIPPED = 'commands beyond low or high, clipped'
+NO_JOINTS = 'messages without all of the joints'
+BACKWARDS = 'messages received earlier than the one before, taken as simultaneous'
+SCORE_NOT_FINITE = 'scores that are not finite'
+SCORE_OF_NOTHING = 'scores of no step, or of fewer than are asked for'
+SCORE_AGAIN = 'scores of steps that were scored before'
+SCORE_DROPPED = 'scores of steps that were dropped'
+SCORE_TRIMMED = 'scores whose last step was dropped, taken as of those before it'
+
+
+Timed = tuple[Transitions | CompositeReward, int]
+"""A record and its time [ns]."""
+
+
+@dataclass
+class Conversion:
+    """What became of a bag."""
+
+    messages: Counter[str] = field(default_factory=Counter)  # read, by topic
+    episodes: int = 0
+    steps: int = 0
+    scores: int = 0
+    scored_steps: int = 0
+    dropped: Counter[str] = field(default_factory=Counter)
+    sizes: tuple[int, int] = (0, 0)  # of observations and actions
+    shortest: float = float('inf')  # [s] between the begins of two steps
+    longest: float = 0.0
+
+
+@dataclass
+class _Step:
+    time: int
+    observation: F64
+    action: F64
+
+
+class Converter:
+    """Makes records of messages, one after the other.
+
+    Args:
+        rules: the mapping.
+        run_id: of the records.
+    """
+
+    def __init__(self, rules: Mapping, run_id: str) -> None:
+        self.found = Conversion()
+        self._rules = rules
+        self._run_id = run_id
+        self._now = 0
+        self._held: list[tuple[int, F64] | None] = [None] * len(rules.observation)
+        self._seconds = 0  # [ns] that the last whole step took; 0 in an episode's first
+        # what held that long after the pending step's begin, once that time has passed
+        self._then: tuple[int, list[tuple[int, F64] | None]] | None = None
+        self._command: tuple[int, F64] | None = None
+        self._tick: int | None = None  # when the next step begins, at a fixed rate
+        self._pending: _Step | None = None  # begun, its next observation is not known yet
+        self._steps: list[_Step] = []  # whole and not yet written
+        self._last: F64 = np.empty(0)  # the observation after them
+        self._episode = -1
+        self._open = False
+        self._written = 0  # steps of the episode that were written
+        self._begun = 0  # steps of the episode that were begun and not dropped
+        self._scored = 0  # its steps before this one have had their score
+        self._scores: list[tuple[int, int, float]] = []  # first step, length, value
+        self._sequence = 0
+
+    def feed(self, message: Message) -> Iterator[Timed]:
+        """Take a message; the records that are whole with it."""
+        if message.log_time < self._now:
+            self.found.dropped[BACKWARDS] += 1
+        self._now = max(self._now, message.log_time)
+        self.found.messages[message.topic] += 1
+        yield from self._until(self._now)
+        self._look()
+        for i, values in enumerate(self._rules.observation):
+            if values.topic == message.topic:
+                array = self._numbers(message, values)
+                if array is not None:
+                    self._held[i] = (self._now, array)
+        if message.topic == self._rules.action.topic:
+            array = self._numbers(message, self._rules.action)
+            if array is not None:
+                yield from self._commanded(array)
+        if message.topic == self._rules.score.topic:
+            self._score(message)
+        if message.topic == self._rules.episode.topic and self._ends(message):
+            yield from self._end(self._rules.episode.terminal)
+
+    def finish(self) -> Iterator[Timed]:
+        """The bag has ended."""
+        yield from self._until(self._now + 1)
+        yield from self._end(False)
+        yield from self._give_scores()
+
+    def _numbers(self, message: Message, values: mapping.Values) -> F64 | None:
+        array = mapping.numbers(message.message, values)
+        if array is None:
+            self.found.dropped[NO_JOINTS] += 1
+        return array
+
+    def _ends(self, message: Message) -> bool:
+        rule = self._rules.episode
+        if rule.field is None:
+            return True
+        return bool(mapping.field(message.message, rule.field, message.topic) == rule.equals)
+
+    # ------------------------------------------------------------------------------------------
+    # steps
+
+    def _until(self, now: int) -> Iterator[Timed]:
+        """What time alone brings about before `now`: steps at a fixed rate, and gaps."""
+        gap = round(self._rules.episode.gap * NS)
+        while self._command is not None:
+            over = self._command[0] + gap
+            if self._tick is not None and self._tick < now and self._tick <= over:
+                yield from self._begin(self._tick, self._command[1])
+                if self._tick is not None:
+                    assert self._rules.sampling.rate is not None
+                    self._tick += round(NS / self._rules.sampling.rate)
+            elif over < now:
+                yield from self._end(False)
+            else:
+                return
+
+    def _commanded(self, values: F64) -> Iterator[Timed]:
+        fresh = self._command is None
+        self._command = (self._now, values)
+        if self._rules.sampling.by == 'command':
+            yield from self._begin(self._now, values)
+        elif fresh or self._tick is None:
+            self._tick = self._now
+
+    def _look(self) -> None:
+        """Keep what holds when a step that may turn out to be the last has taken its time."""
+        if self._pending is not None and self._then is None and self._seconds:
+            over = self._pending.time + self._seconds
+            if self._now > over:
+                self._then = (over, list(self._held))
+
+    def _observed(self, now: int, held: list[tuple[int, F64] | None]) -> F64 | None:
+        """What holds now; None where something is missing or too old."""
+        oldest = now - round(self._rules.sampling.max_age * NS)
+        parts = [one[1] for one in held if one is not None and one[0] >= oldest]
+        return np.concatenate(parts) if len(parts) == len(held) else None
+
+    def _begin(self, now: int, command: F64) -> Iterator[Timed]:
+        """Begin a step."""
+        observation = self._observed(now, self._held)
+        if observation is None:
+            self.found.dropped[NO_OBSERVATION] += 1
+            yield from self._end(False)
+            return
+        if not (_finite(observation) and _finite(command)):
+            self.found.dropped[NOT_FINITE] += 1
+            yield from self._end(False)
+            return
+        action = self._scaled(command)
+        self._check_sizes(len(observation), len(action))
+        if self._pending is not None:
+            self._seconds = now - self._pending.time
+            self.found.shortest = min(self.found.shortest, self._seconds / NS)
+            self.found.longest = max(self.found.longest, self._seconds / NS)
+            yield from self._complete(observation)
+        elif not self._open:
+            yield from self._give_scores()
+            self._open = True
+            self._episode += 1
+            self._written = self._begun = self._scored = 0
+        self._pending = _Step(now, observation, action)
+        self._then = None
+        self._begun += 1
+
+    def _complete(self, observation: F64) -> Iterator[Timed]:
+        """The next observation of the pending step is known."""
+        assert self._pending is not None
+        room = max(1, CHUNK_BYTES // (4 * (len(observation) + len(self._pending.action))))
+        if len(self._steps) >= room:
+            yield from self._write(False, False)
+        self._steps.append(self._pending)
+        self._last = observation
+        self._pending = None
+
+    def _end(self, terminal: bool) -> Iterator[Timed]:
+        """End the episode, if one is going on."""
+        pending, self._command, self._tick = self._pending, None, None
+        if pending is not None:
+            self._look()
+            when, held = self._then or (self._now, self._held)
+            seen = any(one is not None and one[0] > pending.time for one in held)
+            after = self._observed(when, held) if seen else None
+            if after is not None and _finite(after):
+                yield from self._complete(after)
+            else:
+                self.found.dropped[NO_NEXT] += 1
+                self._pending = None
+                self._begun -= 1
+        if self._steps:
+            self.found.episodes += 1
+            yield from self._write(terminal, not terminal)
+        elif self._open and not self._written:
+            self._episode -= 1  # nothing of it is left
+        self._open = False
+        self._seconds = 0
+
+    def _scaled(self, command: F64) -> F64:
+        low, high = np.asarray(self._rules.action.low), np.asarray(self._rules.action.high)
+        for name, bound in (('low', low), ('high', high)):
+            if bound.size not in (1, len(command)):
+                raise FitError(
+                    f'mapping: action.{name} has {bound.size} values, a command on '
+                    f'{self._rules.action.topic} has {len(command)}'
+                )
+        scaled: F64 = 2 * (command - low) / (high - low) - 1
+        if (np.abs(scaled) > 1 + 1e-9).any():
+            self.found.dropped[CLIPPED] += 1
+        return np.clip(scaled, -1, 1)
+
+    def _check_sizes(self, observations: int, actions: int) -> None:
+        sizes = (observations, actions)
+        if self.found.sizes == (0, 0):
+            self.found.sizes = sizes
+        if self.found.sizes != sizes:
+            raise FitError(
+                f'observations and actions had the sizes {self.found.sizes}, and now {sizes}: a '
+                'field in the mapping has no fixed length. Name elements, or joints'
+            )
+
+    def _write(self, terminated: bool, truncated: bool) -> Iterator[Timed]:
+        steps, self._steps = self._steps, []
+        observations = [step.observation for step in steps] + [self._last]
+        chunk = Transitions(
+            self._run_id,
+            self._rules.source,
+            sequence=self._sequence,
+            phase=0,
+            episode=self._episode,
+            first_step=self._written,
+            steps=len(steps),
+            observations=_f32(observations),
+            actions=_f32([step.action for step in steps]),
+            terminated=terminated,
+            truncated=truncated,
+            phase_end=False,
+            scores_due=0,
+        )
+        self._sequence += 1
+        self._written += len(steps)
+        self.found.steps += len(steps)
+        yield chunk, self._now
+
+    # ------------------------------------------------------------------------------------------
+    # scores
+
+    def _score(self, message: Message) -> None:
+        rule = self._rules.score
+        value = mapping.field(message.message, rule.field, rule.topic)
+        try:
+            number = float(value)
+        except (TypeError, ValueError):
+            raise FitError(f'{rule.topic}: field {rule.field!r} holds no number') from None
+        length = self._begun - self._scored if rule.steps is None else rule.steps
+        first = self._begun - length
+        if not np.isfinite(number):
+            self.found.dropped[SCORE_NOT_FINITE] += 1
+        elif length < 1 or first < 0:
+            self.found.dropped[SCORE_OF_NOTHING] += 1
+        elif first < self._scored:
+            self.found.dropped[SCORE_AGAIN] += 1
+        else:
+            self._scores.append((first, length, number))
+            self._scored = self._begun
+
+    def _give_scores(self) -> Iterator[Timed]:
+        """The scores of the episode that has ended, once no more can come."""
+        scores, self._scores = self._scores, []
+        for first, length, value in scores:
+            there = min(length, self._written - first)
+            if there < length:
+                trimmed = self._rules.score.of == 'since_last' and there > 0
+                self.found.dropped[SCORE_TRIMMED if trimmed else SCORE_DROPPED] += 1
+                if not trimmed:
+                    continue
+            yield (
+                CompositeReward(
+                    self._run_id,
+                    self._rules.source,
+                    scorer=self._rules.source,
+                    sequence=self.found.scores,
+                    episode=self._episode,
+                    first_step=first,
+                    length=there,
+                    value=value,
+                ),
+                self._now,
+            )
+            self.found.scores += 1
+            self.found.scored_steps += there
+
+
+def _finite(values: F64) -> bool:
+    """Whether these are numbers that float32 has."""
+    return bool((np.abs(values) <= np.finfo(np.float32).max).all())
+
+
+def _f32(rows: list[F64]) -> F32:
+    return np.asarray(rows, np.float64).astype(np.float32)

@@ -1,0 +1,201 @@
+"""The mapping file of `codetr convert`: which topics are observation, action and score."""
+
+import re
+from collections.abc import Mapping as AnyMapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import yaml
+from pydantic import Field, model_validator
+
+from codetr_ros.config import Group, SettingsError, validate
+from codetr_ros.offline.errors import FitError
+from codetr_ros.records import F64
+
+Topic = Annotated[str, Field(pattern=r'^/\S+$')]
+Path_ = Annotated[str, Field(pattern=r'^[A-Za-z_]\w*(\[\d+\])?(\.[A-Za-z_]\w*(\[\d+\])?)*$')]
+
+
+class Values(Group):
+    """Numbers in the messages of a topic."""
+
+    topic: Topic = Field(description='full name')
+    fields: tuple[Path_, ...] = Field(
+        min_length=1,
+        description='fields in this order, such as position, data[0] or pose.position.x; of an '
+        'array all elements',
+    )
+    joints: tuple[str, ...] | None = Field(
+        None,
+        min_length=1,
+        description='of array fields only the elements of these joints, in this order, by the '
+        'field `name` of the message (sensor_msgs/JointState)',
+    )
+
+
+class Action(Values):
+    """The command topic."""
+
+    low: float | tuple[float, ...] = Field(
+        -1.0, description='command that becomes -1; one for all components, or one for each'
+    )
+    high: float | tuple[float, ...] = Field(1.0, description='command that becomes 1')
+
+    @model_validator(mode='after')
+    def _ordered(self) -> 'Action':
+        low, high = np.atleast_1d(self.low), np.atleast_1d(self.high)
+        if len(low) != len(high) and 1 not in (len(low), len(high)):
+            raise ValueError(f'low has {len(low)} values, high has {len(high)}')
+        if not (low < high).all():
+            raise ValueError(f'low = {self.low} must be less than high = {self.high}')
+        return self
+
+
+class Score(Group):
+    """The score topic."""
+
+    topic: Topic = Field(description='full name')
+    field: Path_ = Field('data', description='the number that is the score')
+    of: Literal['since_last', 'last_steps'] = Field(
+        'since_last',
+        description='since_last: of all steps since the last score or the begin of the episode; '
+        'last_steps: of the last `steps` steps',
+    )
+    steps: int | None = Field(None, ge=1, le=100_000, description='how many, where last_steps')
+
+    @model_validator(mode='after')
+    def _steps_where_needed(self) -> 'Score':
+        if (self.of == 'last_steps') != (self.steps is not None):
+            raise ValueError('steps is to be given where `of` is last_steps, and only there')
+        return self
+
+
+class Episodes(Group):
+    """Where episodes end."""
+
+    topic: Topic | None = Field(None, description='a message on it ends the episode')
+    field: Path_ | None = Field(None, description='only where this field ...')
+    equals: bool | int | float | str | None = Field(None, description='... has this value')
+    terminal: bool = Field(
+        False, description='such an end is a terminal state, not merely the end of the recording'
+    )
+    gap: float = Field(
+        1.0, gt=0, le=86_400, description='seconds without a command that end the episode too'
+    )
+
+    @model_validator(mode='after')
+    def _field_and_value(self) -> 'Episodes':
+        if (self.field is None) != (self.equals is None):
+            raise ValueError('field and equals belong together: both are needed, or neither')
+        if self.field is not None and self.topic is None:
+            raise ValueError('field without a topic')
+        return self
+
+
+class Sampling(Group):
+    """When a step is taken."""
+
+    by: Literal['command', 'rate'] = Field(
+        'command', description='command: a step for each command; rate: at a fixed rate'
+    )
+    rate: float | None = Field(None, gt=0, le=10_000, description='steps per second, where rate')
+    max_age: float = Field(
+        0.2, gt=0, le=3600, description='seconds after which an observation is too old to be held'
+    )
+
+    @model_validator(mode='after')
+    def _rate_where_needed(self) -> 'Sampling':
+        if (self.by == 'rate') != (self.rate is not None):
+            raise ValueError('rate is to be given where `by` is rate, and only there')
+        return self
+
+
+class Mapping(Group):
+    """A mapping file."""
+
+    source: str = Field('robot', pattern=r'^[A-Za-z_]\w*$', description='name of the robot')
+    observation: tuple[Values, ...] = Field(min_length=1, description='one after the other')
+    action: Action
+    score: Score
+    episode: Episodes = Field(default_factory=Episodes)
+    sampling: Sampling = Field(default_factory=Sampling)
+
+    @property
+    def topics(self) -> set[str]:
+        """All topics that it names."""
+        named = {values.topic for values in self.observation}
+        named |= {self.action.topic, self.score.topic}
+        return named | ({self.episode.topic} if self.episode.topic else set())
+
+
+def load(path: Path) -> Mapping:
+    """Read a mapping file.
+
+    Raises:
+        SettingsError: it cannot be read, is not YAML, or something in it is refused.
+    """
+    try:
+        data = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise SettingsError(f'mapping {path} cannot be read: {error.strerror}') from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise SettingsError(f'mapping {path} is not YAML: {error}') from None
+    if not isinstance(data, AnyMapping):
+        raise SettingsError(f'mapping {path} must hold a mapping, not {type(data).__name__}')
+    return validate(Mapping, data, f'mapping {path}')
+
+
+_PART = re.compile(r'(\w+)(?:\[(\d+)\])?$')
+
+
+def field(message: Any, path: str, topic: str) -> Any:
+    """The value of a field of a message.
+
+    Raises:
+        FitError: the message has no such field or element.
+    """
+    value = message
+    for part in path.split('.'):
+        found = _PART.match(part)
+        assert found is not None  # the pattern of the mapping
+        name, index = found[1], found[2]
+        if not hasattr(value, name):
+            there = [n for n in getattr(value, '__dict__', ()) if not n.startswith('_')]
+            raise FitError(
+                f'{topic} has no field {path!r}: there is no {name!r} in '
+                + (', '.join(there) or type(value).__name__)
+            )
+        value = getattr(value, name)
+        if index is not None:
+            if not hasattr(value, '__len__') or int(index) >= len(value):
+                raise FitError(f'{topic} has no element {path!r} in a message')
+            value = value[int(index)]
+    return value
+
+
+def numbers(message: Any, values: Values) -> F64 | None:
+    """The numbers of a message, in order; None where it has not all of the joints.
+
+    Raises:
+        FitError: a field does not exist or holds no numbers.
+    """
+    rows: list[int] | None = None
+    if values.joints is not None:
+        names = list(field(message, 'name', values.topic))
+        if any(joint not in names for joint in values.joints):
+            return None
+        rows = [names.index(joint) for joint in values.joints]
+    found = []
+    for path in values.fields:
+        value = field(message, path, values.topic)
+        try:
+            array = np.atleast_1d(np.asarray(value, np.float64)).ravel()
+        except (TypeError, ValueError):
+            raise FitError(f'{values.topic}: field {path!r} holds no numbers') from None
+        if rows is not None:
+            if len(array) <= max(rows):
+                return None  # JointState leaves fields empty that are not known
+            array = array[rows]
+        found.append(array)
+    return np.concatenate(found)

@@ -1,0 +1,106 @@
+"""Records a bag as a robot's own software might: no topic in it is this project's.
+
+    .venv/bin/python examples/robot_arm/make_bag.py /tmp/arm_bag
+
+A made-up arm of two joints gets a velocity command about ten times a second, reports its joints
+fifty times a second, and is scored every two seconds: how near was its hand to the target? Each
+attempt lasts eight seconds and ends with a message. Times jitter, as they do.
+"""
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+NS = 10**9
+BEGIN = 1_700_000_000 * NS  # when the recording begins
+SECONDS = 8.0  # of an attempt
+TARGET = np.array([0.5, 1.2])  # [m]
+FASTEST = np.array([1.5, 2.0])  # [rad/s] of shoulder and elbow
+
+
+def hand(joints: np.ndarray) -> np.ndarray:
+    """Where the hand of an arm with links of one metre is."""
+    upper, fore = joints[0], joints.sum()
+    return np.array([np.cos(upper) + np.cos(fore), np.sin(upper) + np.sin(fore)])
+
+
+def attempt(rng: np.random.Generator, begin: int) -> Iterator[tuple[int, str, Any]]:
+    """Time [ns], topic and value of everything in one attempt."""
+    joints, speed = rng.uniform(-1.5, 1.5, 2), np.zeros(2)
+    command, toward = np.zeros(2), rng.uniform(-1, 1, 2)
+    near: list[float] = []
+    for tick in range(round(SECONDS * 50)):
+        now = begin + round((tick + rng.uniform(0, 0.2)) * NS / 50)
+        yield now, '/joint_states', (joints.copy(), speed.copy())
+        if tick % 5 == 0:  # the controller wanders about, now and then in another direction
+            toward = rng.uniform(-1, 1, 2) if rng.random() < 0.2 else toward
+            command = np.clip(toward + 0.3 * rng.normal(size=2), -1, 1) * FASTEST
+            yield now + 2_000_000, '/arm/velocity_commands', command
+        speed += 0.5 * (command - speed)
+        joints = joints + speed / 50
+        near.append(float(np.exp(-np.linalg.norm(hand(joints) - TARGET))))
+        if tick % 100 == 99:
+            yield now + 4_000_000, '/judge/score', 20 * float(np.mean(near))
+            near.clear()
+    yield begin + round(SECONDS * NS), '/arm/attempt_ended', None
+
+
+def message(store: Any, topic: str, value: Any, now: int) -> Any:
+    """The message that a topic carries."""
+    types = store.types
+    if topic == '/joint_states':
+        position, velocity = value
+        stamp = types['builtin_interfaces/msg/Time'](*divmod(now, NS))
+        header = types['std_msgs/msg/Header'](stamp, 'base')
+        # the gripper is none of our business, and comes between the two joints that are
+        return types['sensor_msgs/msg/JointState'](
+            header,
+            ['elbow', 'gripper', 'shoulder'],
+            np.array([position[1], 0.02, position[0]]),
+            np.array([velocity[1], 0.0, velocity[0]]),
+            np.empty(0),
+        )
+    if topic == '/arm/velocity_commands':
+        layout = types['std_msgs/msg/MultiArrayLayout']([], 0)
+        return types['std_msgs/msg/Float64MultiArray'](layout, value)
+    if topic == '/judge/score':
+        return types['std_msgs/msg/Float64'](value)
+    return types['std_msgs/msg/Empty'](0)
+
+
+def write(
+    folder: Path,
+    attempts: int = 30,
+    seed: int = 0,
+    storage: StoragePlugin = StoragePlugin.MCAP,
+) -> None:
+    """Write the bag."""
+    rng, store = np.random.default_rng(seed), get_typestore(Stores.ROS2_JAZZY)
+    connections: dict[str, Any] = {}
+    with Writer(folder, version=9, storage_plugin=storage) as bag:
+        for n in range(attempts):
+            for now, topic, value in attempt(rng, BEGIN + round(n * (SECONDS + 3) * NS)):
+                made = message(store, topic, value, now)
+                kind = made.__msgtype__
+                if topic not in connections:
+                    connections[topic] = bag.add_connection(topic, kind, typestore=store)
+                bag.write(connections[topic], now, store.serialize_cdr(made, kind))
+
+
+def main() -> None:
+    """Make the bag that the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('folder', type=Path, help='the new bag')
+    parser.add_argument('--attempts', type=int, default=30)
+    parser.add_argument('--seed', type=int, default=0)
+    given = parser.parse_args()
+    write(given.folder, given.attempts, given.seed)
+
+
+if __name__ == '__main__':
+    main()

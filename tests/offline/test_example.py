@@ -1,0 +1,89 @@
+"""The worked example of docs/other-peoples-data.md, from a robot's own bag to labelled steps."""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin
+
+from codetr_ros import cli
+from codetr_ros.bags.reader import Bag
+from codetr_ros.bags.verify import verify
+from codetr_ros.records import CompositeReward, StepRewards, Transitions
+
+ARM = Path(__file__).resolve().parents[2] / 'examples' / 'robot_arm'
+
+
+@pytest.fixture(scope='module')
+def make_bag():
+    spec = importlib.util.spec_from_file_location('make_bag', ARM / 'make_bag.py')
+    module = importlib.util.module_from_spec(spec)
+    sys.modules['make_bag'] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def convert(bag, out, *more, code=0):
+    mapping = more[0] if more else ARM / 'mapping.yaml'
+    assert cli.main(['convert', str(bag), '--mapping', str(mapping), '--out', str(out)]) == code
+
+
+@pytest.mark.parametrize('storage', list(StoragePlugin))
+def test_the_arms_bag_becomes_steps_a_model_and_labels(make_bag, tmp_path, capsys, storage):
+    make_bag.write(tmp_path / 'arm', 12, storage=storage)
+
+    convert(tmp_path / 'arm', tmp_path / 'steps')
+
+    said = capsys.readouterr().out
+    assert '4 observations, 2 actions' in said
+    assert '12, 960 steps of 0.09' in said
+    assert '48, of 960 steps together' in said
+    assert 'dropped     nothing' in said
+    assert verify(tmp_path / 'steps').sound
+    chunks = [e.record for e in Bag(tmp_path / 'steps').entries((Transitions,))]
+    assert all(np.abs(c.actions).max() <= 1 for c in chunks)
+    # the shoulder's angle follows from its speed: columns are shoulder, elbow, and their speeds
+    for c in chunks:
+        moved = np.diff(c.observations[:, :2], axis=0)
+        assert np.allclose(moved, 0.1 * c.observations[1:, 2:], atol=0.15)
+    scores = [e.record for e in Bag(tmp_path / 'steps').entries((CompositeReward,))]
+    assert {s.length for s in scores} == {20}
+
+    flags = ['--gradient-steps=20', '--check-every=10', '--method=mlp']
+    fit = ['fit', str(tmp_path / 'steps'), '--out', str(tmp_path / 'fit'), *flags]
+    assert cli.main(fit) == 0
+    summary = json.loads((tmp_path / 'fit' / 'summary.json').read_text())
+    assert summary['delay'] == 20
+    label = ['label', str(tmp_path / 'steps'), '--checkpoint', str(tmp_path / 'fit')]
+    assert cli.main([*label, '--out', str(tmp_path / 'labelled')]) == 0
+    labels = [e.record.labels for e in Bag(tmp_path / 'labelled').entries((StepRewards,))]
+    assert sum(map(len, labels)) == 960
+
+
+def test_a_mapping_of_topics_that_are_not_there_names_those_that_are(make_bag, tmp_path, capsys):
+    make_bag.write(tmp_path / 'arm', 1)
+    text = (ARM / 'mapping.yaml').read_text()
+    wrong = tmp_path / 'wrong.yaml'
+
+    wrong.write_text(text.replace('/judge/score', '/judge'))
+    convert(tmp_path / 'arm', tmp_path / 'out', wrong, code=2)
+    said = capsys.readouterr().err
+    assert 'has no topic /judge. It has: /arm/attempt_ended, /arm/velocity_commands' in said
+
+    wrong.write_text(text.replace('[position, velocity]', '[position, torque]'))
+    convert(tmp_path / 'arm', tmp_path / 'out', wrong, code=2)
+    assert "has no field 'torque'" in capsys.readouterr().err
+    wrong.write_text(text.replace('shoulder, elbow', 'wrist'))
+    convert(tmp_path / 'arm', tmp_path / 'out', wrong, code=2)
+    said = capsys.readouterr().err
+    assert 'not one step could be made: ' in said
+    assert '400 messages without all of the joints' in said
+    assert not (tmp_path / 'out').exists()
+
+    convert(tmp_path / 'arm', tmp_path / 'arm', code=2)
+    assert 'exists and holds' in capsys.readouterr().err
+    convert(tmp_path / 'arm', tmp_path / 'out', tmp_path / 'none.yaml', code=2)
+    assert 'none.yaml cannot be read' in capsys.readouterr().err
