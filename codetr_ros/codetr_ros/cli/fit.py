@@ -181,14 +181,10 @@ def _refuse_unfit(settings: Settings) -> None:
 
     fit = [name for name in METHODS if name not in config.IN_PROCESS_ONLY]
     if settings.method not in fit:
-        why = (
-            'a reference for `codetr train --in-process`'
-            if settings.method in config.IN_PROCESS_ONLY
-            else 'no reward model: its policy learner learns from the scores themselves'
+        why = config.IN_PROCESS_ONLY.get(
+            settings.method, 'has no reward model: its policy learner learns from the scores'
         )
-        raise FitError(
-            f'--method {settings.method} is {why}. Choose one of --method {"|".join(fit)}'
-        )
+        raise FitError(f'--method {settings.method} {why}. Choose one of --method {"|".join(fit)}')
 
 
 def _phases(arguments: Sequence[str], given: Arguments) -> int:
