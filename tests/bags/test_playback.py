@@ -13,6 +13,7 @@ from codetr_ros.records import (
     Commit,
     CompositeReward,
     Policy,
+    Presence,
     RunSpec,
     StepRewards,
     Transitions,
@@ -214,6 +215,13 @@ def test_a_survey_says_what_run_a_bag_holds(tmp_path):
     data = [item.data for item in items(bag, 'run')]
     assert data == [bytes(raw.data) for raw in bag.raw()][1:]  # all but the announcement
     assert list(items(bag, 'another')) == []
+
+
+def test_presence_that_another_recorder_has_recorded_is_not_played(tmp_path):
+    counts = np.zeros(0, np.uint64)
+    said = Presence('run', 'sim', '/run/sim', 'an instance', '', False, (), counts, 0)
+    bag = Bag(ours(tmp_path / 'bag', [*a_run(), said]))
+    assert not any(isinstance(item.record, Presence) for item in items(bag, 'run'))
 
 
 @pytest.mark.parametrize('writer', WRITERS)

@@ -20,6 +20,7 @@ from codetr_ros.records import (
     CompositeReward,
     Metrics,
     Policy,
+    Presence,
     Record,
     RunSpec,
     StepRewards,
@@ -116,14 +117,17 @@ def survey(bag: Bag, run_id: str | None = None) -> Recorded:
 
 
 def items(bag: Bag, run_id: str) -> Iterator[Item]:
-    """The messages of a run, in the bag's order; it is announced anew, not played.
+    """The messages of a run, in the bag's order. Its announcement and the words of presence, which
+    others may have recorded, are not among them: they are said anew.
 
     Raises:
         BagError: the bag is damaged.
     """
     for raw in bag.raw():
         entry = bag.entry(raw)
-        if entry is not None and entry.kind is not RunSpec and entry.record.run_id == run_id:
+        if entry is None or entry.kind in (RunSpec, Presence):
+            continue
+        if entry.record.run_id == run_id:
             yield Item(entry.record, bytes(raw.data), entry.log_time)
 
 

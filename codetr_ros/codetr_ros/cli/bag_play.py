@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from codetr_ros import middleware, run_folder
+from codetr_ros import middleware
 from codetr_ros.cli import refuse
 
 DEFAULT_NAMESPACE = '/play'
@@ -71,10 +71,10 @@ def main(arguments: Sequence[str]) -> int:
 
     from codetr_ros.bags.errors import BagError
     from codetr_ros.bags.playback import Pace, PlayError, items, survey
-    from codetr_ros.bags.reader import Bag
+    from codetr_ros.offline.sources import open_bags
 
     try:
-        bag = Bag(_bag(Path(given.bag)))
+        (bag,) = open_bags([Path(given.bag)])
         recorded = survey(bag, given.run)
     except (BagError, PlayError) as error:
         return refuse(str(error))
@@ -96,9 +96,3 @@ def main(arguments: Sequence[str]) -> int:
         given.deadline,
     )
     return code
-
-
-def _bag(path: Path) -> Path:
-    """The bag of a run, where the folder of the run is given."""
-    inside = path / run_folder.BAG
-    return inside if (path / run_folder.CONFIG).is_file() and inside.is_dir() else path
