@@ -146,10 +146,7 @@ class PlayNode(Played, CoreNode):
         self._last = Resender(self.link, self.run_spec.run_id, settings.lag + 2)
 
     def _lacking(self) -> list[str]:
-        lacking = super()._lacking()
-        for other in self._others:
-            lacking += other.lacking()
-        return list(dict.fromkeys(lacking))
+        return super()._lacking() or [text for other in self._others for text in other.lacking()]
 
     def _turn(self, wait: float = 0.0) -> None:
         super()._turn(wait)
