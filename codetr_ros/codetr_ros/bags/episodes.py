@@ -155,7 +155,7 @@ class SourceChecks:
         self._ended[episode] |= ended
         if self.delay is None:
             return
-        first = before // self.delay * self.delay
+        first = max(before, chunk.first_step) // self.delay * self.delay  # not what is missing
         while first < after:
             length = min(self.delay, after - first)
             if length == self.delay or ended:

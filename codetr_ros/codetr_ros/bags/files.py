@@ -9,7 +9,7 @@ from pathlib import Path, PurePath
 import yaml
 
 from codetr_ros.bags.errors import BagError, Damage, Place
-from codetr_ros.bags.metadata import LONGEST, METADATA
+from codetr_ros.bags.metadata import LONGEST, METADATA, load_yaml
 
 STORAGES = ('.mcap', '.db3')
 COMPRESSED = '.zstd'
@@ -37,7 +37,7 @@ def listed_files(folder: Path) -> list[str]:
     try:
         with path.open('rb') as file:
             text = file.read(LONGEST)
-        said = yaml.safe_load(text)['rosbag2_bagfile_information']['relative_file_paths']
+        said = load_yaml(text)['rosbag2_bagfile_information']['relative_file_paths']
         return [PurePath(name).name for name in said]
     except FileNotFoundError:
         return []

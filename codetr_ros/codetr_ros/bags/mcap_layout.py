@@ -23,6 +23,7 @@ HEAD = struct.Struct('<BQ')  # opcode, length of what follows
 CHUNK = struct.Struct('<QQQII')  # start, end, size, crc, length of the compression's name
 MESSAGE = struct.Struct('<BQHIQQ')  # head, channel, sequence, log time, publish time
 MESSAGE_BODY = MESSAGE.size - HEAD.size
+_PIECE = 1 << 20
 _CHUNK_START = re.compile(
     rb'\x06.{8}.{28}(?:\x00{4}|\x03\x00{3}lz4|\x04\x00{3}zstd).{8}', re.DOTALL
 )
@@ -81,20 +82,48 @@ def decompressed(data: memoryview, compression: str, size: int) -> bytes | memor
         raw: bytes | memoryview = data
     elif compression == 'zstd':
         try:
-            with zstandard.ZstdDecompressor().stream_reader(data) as stream:
-                raw = stream.read(size + 1)
-        except (zstandard.ZstdError, MemoryError) as error:
+            raw = unzstd(data, size)
+        except zstandard.ZstdError as error:
             raise FaultError(f'its zstd data is damaged ({error})') from error
     elif compression == 'lz4':
         try:
-            raw = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
-        except (RuntimeError, MemoryError) as error:
+            raw = _unlz4(data, size)
+        except (RuntimeError, EOFError) as error:
             raise FaultError(f'its lz4 data is damaged ({error})') from error
     else:
         raise FaultError(f'its compression {compression!r} is not known')
     if len(raw) != size:
         raise FaultError(f'it has {len(raw)} bytes where {size} are announced')
     return raw
+
+
+def unzstd(data: bytes | memoryview, most: int) -> bytes:
+    """Unpack data piece by piece, so that it takes what it has, not what it announces.
+
+    Args:
+        data: compressed.
+        most: a byte more than this is the last that is unpacked.
+
+    Raises:
+        zstandard.ZstdError: it is damaged.
+    """
+    found = BytesIO()
+    with zstandard.ZstdDecompressor().stream_reader(data) as stream:
+        while found.tell() <= most and (piece := stream.read(min(_PIECE, most + 1))):
+            found.write(piece)
+    return found.getvalue()
+
+
+def _unlz4(data: memoryview, most: int) -> bytes:
+    found = BytesIO()
+    stream = lz4.frame.LZ4FrameDecompressor()
+    piece: bytes = stream.decompress(data, max_length=_PIECE)
+    while piece:
+        found.write(piece)
+        if stream.eof or found.tell() > most:
+            break
+        piece = stream.decompress(b'', max_length=_PIECE)
+    return found.getvalue()
 
 
 def chunk_head(content: bytes) -> tuple[int, int, int, int, int]:

@@ -16,6 +16,18 @@ LONGEST = 16 << 20
 """Bytes of the file that are read."""
 
 
+_LOADER: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)  # the same in C, ten times as fast
+
+
+def load_yaml(text: bytes | str) -> Any:
+    """Read YAML that a bag has.
+
+    Raises:
+        yaml.YAMLError: it is none.
+    """
+    return yaml.load(text, _LOADER)
+
+
 class Topic(Protocol):
     """A topic as it is to be described."""
 
@@ -121,7 +133,7 @@ def check(
         yield f'{METADATA} is missing: `ros2 bag` does not open the bag without it'
         return
     try:
-        said = yaml.safe_load(path.read_bytes()[:LONGEST])['rosbag2_bagfile_information']
+        said = load_yaml(path.read_bytes()[:LONGEST])['rosbag2_bagfile_information']
         yield from _contradictions(said, found, files)
     except (
         OSError,

@@ -25,7 +25,7 @@ from codetr_ros.bags.definitions import Definition, check_own, decode, parsed
 from codetr_ros.bags.errors import BagError, Damage, Place
 from codetr_ros.bags.files import COMPRESSED, bag_files
 from codetr_ros.bags.mcap_file import McapFile, OnDamage, RawMessage
-from codetr_ros.bags.mcap_layout import LARGEST_RECORD
+from codetr_ros.bags.mcap_layout import LARGEST_RECORD, unzstd
 from codetr_ros.bags.sqlite_file import SqliteFile
 from codetr_ros.received import RECORD_TYPES, type_name
 from codetr_ros.records import Record, RecordError
@@ -261,8 +261,7 @@ def open_file(
 
 
 def _decompressed(data: bytes | memoryview) -> bytes:
-    with zstandard.ZstdDecompressor().stream_reader(data) as stream:
-        found = stream.read(LARGEST_RECORD + 1)
+    found = unzstd(data, LARGEST_RECORD)
     if len(found) > LARGEST_RECORD:
         raise zstandard.ZstdError(f'more than {LARGEST_RECORD} bytes')
     return found

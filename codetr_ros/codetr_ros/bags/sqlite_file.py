@@ -114,6 +114,7 @@ def _channels(connection: sqlite3.Connection) -> dict[int, Channel]:
             for name, encoding, text in connection.execute(
                 'SELECT topic_type, encoding, encoded_message_definition FROM message_definitions'
             )
+            if isinstance(encoding, str) and isinstance(text, str)
         }
     columns = _columns(connection, 'topics')
     optional = [
@@ -121,9 +122,12 @@ def _channels(connection: sqlite3.Connection) -> dict[int, Channel]:
         for name in ('offered_qos_profiles', 'type_description_hash')
     ]
     found = {}
-    for number, topic, kind, encoding, qos, digest in connection.execute(
+    for number, *said in connection.execute(
         f'SELECT id, name, type, serialization_format, {", ".join(optional)} FROM topics'
     ):
+        if type(number) is not int or not all(isinstance(text, str) for text in said):
+            raise sqlite3.DatabaseError(f'the row of topic {said[0]!r} is damaged')
+        topic, kind, encoding, qos, digest = said
         definition = Definition(*definitions.get(kind, ('', '')), digest)
         found[number] = Channel(topic, kind, encoding, definition, qos)
     return found
