@@ -225,8 +225,8 @@ def length_field(bag: Path, rng: random.Random) -> None:
 def lengths(record: Record, data: bytes) -> list[int]:
     """Where in a message the lengths of its texts and arrays are."""
     found = []
-    for field in fields(record):
-        value = getattr(record, field.name)
+    for known in fields(record):
+        value = getattr(record, known.name)
         if isinstance(value, str):
             text = value.encode() + b'\0'
             found.append(data.find(len(text).to_bytes(4, 'little') + text))
