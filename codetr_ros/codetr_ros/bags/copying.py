@@ -18,7 +18,7 @@ from mcap.writer import CompressionType, Writer
 from codetr_ros.bags.definitions import bundled_text
 from codetr_ros.bags.errors import BagError
 from codetr_ros.bags.mcap_file import LIBRARY, Channel, RawMessage
-from codetr_ros.bags.metadata import METADATA, BagFile, render
+from codetr_ros.bags.metadata import METADATA, BagFile, load_yaml, render
 from codetr_ros.bags.writer import CHUNK_BYTES
 from codetr_ros.run_folder import atomic_write, sync_folder
 
@@ -42,7 +42,7 @@ class _Topic:
 
     def qos(self) -> list[dict[str, Any]]:
         try:
-            said = yaml.safe_load(self.channel.qos)
+            said = load_yaml(self.channel.qos)
         except yaml.YAMLError:
             return []
         return said if isinstance(said, list) else []
