@@ -45,7 +45,7 @@ def test_what_was_flushed_survives_a_disk_that_is_full(disk, moment):
     ) as e:
         moment(writer)
     assert f'It holds the {writer.size} bytes flushed before' in str(e.value)
-    assert f'`codetr bag recover {disk / "bag"}` makes it whole' in str(e.value)
+    assert f'`codetr bag recover {disk / "bag"} --out NEW` makes it whole' in str(e.value)
     path = disk / 'bag' / 'bag_0.mcap'
     assert path.stat().st_size == writer.size
     assert sequences(path) == list(range(30))

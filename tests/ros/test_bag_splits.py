@@ -10,6 +10,7 @@ from ros.test_bag_writer import COMMITS, TRANSITIONS, child, raw, sequences
 from rosbags.highlevel import AnyReader
 
 from codetr_ros.bags.errors import BagError
+from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.writer import McapWriter
 
 MESSAGES = 40
@@ -51,6 +52,19 @@ def test_rosbags_reads_all_files_as_one_bag(tmp_path):
     with AnyReader([tmp_path / 'bag']) as bag:
         read = list(bag.messages())
     assert [bytes(data) for _, _, data in read] == [raw(i, steps=100) for i in range(MESSAGES)]
+
+
+def test_our_reader_reads_all_files_as_one_bag_closed_or_not(tmp_path):
+    split_bag(tmp_path / 'closed')
+    open_ = McapWriter(tmp_path / 'open', [TRANSITIONS], chunk_bytes=2000, split_bytes=SPLIT)
+    write_all(open_)
+    open_.flush()
+    damage = []
+    for bag in (Bag(tmp_path / 'closed'), Bag(tmp_path / 'open', damage.append)):
+        assert len(bag.files) >= 3
+        assert [m.sequence for m in bag.raw()] == list(range(MESSAGES))
+    assert all('without its index' in str(said.text) for said in damage) and len(damage) == 1
+    open_.close()
 
 
 def test_each_file_is_whole_by_itself(tmp_path):

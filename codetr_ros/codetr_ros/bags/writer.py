@@ -210,8 +210,8 @@ class McapWriter:
         return BagError(
             f'bag {self._path or self.folder} cannot be written: {error.strerror}. It holds the '
             f'{self.size} bytes flushed before, the last file without an index: make room, '
-            f'`codetr bag recover {self.folder}` makes it whole; start the run again in another '
-            f'folder'
+            f'`codetr bag recover {self.folder} --out NEW` makes it whole; start the run again in '
+            f'another folder'
         )
 
     def close(self) -> None:
@@ -231,6 +231,6 @@ class McapWriter:
             atomic_write(self.folder / METADATA, render(self._files, self._topics.values()))
         except OSError as error:
             raise BagError(
-                f'bag {self.folder} is whole but {METADATA} cannot be written: '
-                f'{error.strerror}; make room, `codetr bag recover {self.folder}` writes it'
+                f'bag {self.folder} is whole but {METADATA} cannot be written: {error.strerror}; '
+                f'make room, `codetr bag recover {self.folder} --out NEW` writes it'
             ) from error
