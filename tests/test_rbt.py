@@ -182,6 +182,23 @@ def test_the_next_observation_is_predicted_from_its_step_and_those_before_alone(
                 assert not moved[:step].any() and moved[step:].all()
 
 
+def test_next_observations_far_from_those_of_the_warm_up_do_not_drown_the_rewards():
+    data = filled()
+    rbt = made(data)
+    chunk = builders.transitions(
+        sequence=3,
+        episode=3,
+        steps=7,
+        observations=np.full((8, O), 1e5, np.float32),
+        actions=np.zeros((7, A), np.float32),
+        truncated=True,
+    )
+    data.append(chunk)
+    data.score(builders.score(sequence=20, episode=3, length=7))
+    losses = [rbt.gradient_step(data, generator(0, i))['state_loss'] for i in range(10)]
+    assert 10 < max(losses) < 150  # an error of 10 deviations squared, and some
+
+
 def test_the_weight_of_the_state_loss_is_what_the_settings_say():
     data = filled()
     plain, heavy, without = (

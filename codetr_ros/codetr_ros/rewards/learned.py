@@ -26,6 +26,12 @@ STD_FLOOR = 1e-2
 A component that stood still in the warm-up may move later: it must not drown the others then.
 """
 
+CLIP = 10.0
+"""Deviations at which standardised observations are cut off, if at all (decided here).
+
+A component that hardly moved in the warm-up may lie a thousand of its deviations away later.
+"""
+
 
 class Learned(RewardMethod):
     """A method that fits a network to composite rewards by gradient steps.
@@ -43,7 +49,8 @@ class Learned(RewardMethod):
     clip: ClassVar[float] = math.inf
     """Deviations from the mean beyond which standardised observations are cut off.
 
-    For networks that do not normalise their inputs themselves, as the transformer does.
+    For networks that do not normalise their inputs themselves, as the transformer does, and where
+    observations are predicted.
     """
 
     def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:

@@ -15,15 +15,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from codetr_ros.rewards.learned import Learned
+from codetr_ros.rewards.learned import CLIP, Learned
 from codetr_ros.rewards.method import segment_steps
 from codetr_ros.trajectories import SegmentBatch, Trajectories
-
-CLIP = 10.0
-"""Deviations at which a perceptron's standardised observations are cut off (decided here).
-
-A component that hardly moved in the warm-up may lie a thousand of its deviations away later.
-"""
 
 
 class Mlp(Learned):

@@ -28,10 +28,10 @@ hand:
   it, as here if `codetr.labelling` is 'window'. By default a segment's steps are labelled in one
   pass, from the window of segments that ends with theirs.
 * Composite rewards are in units of the target scale c and observations, the predicted ones too,
-  are standardised. Architecture, attention scale, initial weights, learning rate and number of
-  gradient steps are by the settings `codetr`, so that RBT is compared with CoDeTr and not with
-  other settings. There it is one head, an unscaled attention, a learning rate of 1e-4 that rises
-  to 1e-3 and falls again, and four times as many gradient steps.
+  are standardised and cut off at 10 deviations. Architecture, attention scale, initial weights,
+  learning rate and number of gradient steps are by the settings `codetr`, so that RBT is compared
+  with CoDeTr and not with other settings. There it is one head, an unscaled attention, a learning
+  rate of 1e-4 that rises to 1e-3 and falls again, and four times as many gradient steps.
 """
 
 from typing import ClassVar
@@ -41,6 +41,7 @@ import torch
 from torch import Tensor, nn
 
 from codetr_ros.config import CodetrSettings, Settings
+from codetr_ros.rewards.learned import CLIP
 from codetr_ros.rewards.method import segment_steps
 from codetr_ros.rewards.sequence import SequenceMethod
 from codetr_ros.rewards.transformer import CausalTransformer, SequenceWeights, initialise
@@ -57,6 +58,7 @@ class Rbt(SequenceMethod):
     """
 
     name: ClassVar[str] = 'rbt'
+    clip: ClassVar[float] = CLIP  # of the observations that it predicts
 
     def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
         several = settings.rbt.attention_scope == 'window'

@@ -34,8 +34,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from codetr_ros.records import I64
-from codetr_ros.rewards.learned import Learned
-from codetr_ros.rewards.mlp import CLIP, perceptron
+from codetr_ros.rewards.learned import CLIP, Learned
+from codetr_ros.rewards.mlp import perceptron
 from codetr_ros.trajectories import SegmentBatch, Trajectories
 
 
