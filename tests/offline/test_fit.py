@@ -140,6 +140,22 @@ def test_settings_come_from_the_run_a_config_or_the_flags(a_run, tmp_path):
     assert short['skipped']['scores of more steps than the delay'] > 100
 
 
+def test_a_fit_goes_on_from_a_saved_model(a_run, tmp_path, capsys):
+    first = quickly(a_run.bag, tmp_path / 'first', '--codetr.layers=2')
+
+    again = quickly(a_run.bag, tmp_path / 'again', f'--checkpoint={tmp_path / "first"}')
+
+    assert again['settings']['codetr']['layers'] == 2
+    at = first['gradient_steps']
+    assert [row['gradient_steps'] for row in again['curve']] == [at, at + 10, at + 20, at + 30]
+    assert again['curve'][0]['held_out_loss'] == first['best']['held_out_loss']
+    flags = [f'--checkpoint={tmp_path / "first"}', '--codetr.layers=1']
+    quickly(a_run.bag, tmp_path / 'other', *flags, code=1)
+    assert 'has codetr.layers = 2, here 1' in capsys.readouterr().err
+    quickly(a_run.bag, tmp_path / 'other', '--frozen', code=2)
+    assert 'a frozen model is not fitted' in capsys.readouterr().err
+
+
 def test_what_cannot_be_fitted_is_refused_and_named(a_run, tmp_path, capsys):
     def refused(*arguments):
         fit(*arguments, tmp_path / 'out', code=2)

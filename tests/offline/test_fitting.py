@@ -15,7 +15,7 @@ from codetr_ros.offline.episodes import Index, stretches
 from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.loading import load, newest
 from codetr_ros.offline.settings import FitSettings
-from codetr_ros.records import TrueRewards
+from codetr_ros.records import CompositeReward, TrueRewards
 
 SIZES = 3, 2
 DELAY = 7
@@ -185,6 +185,37 @@ def test_the_fit_ends_early_when_the_held_out_loss_does_not_fall(tmp_path):
     last = fitted.curve[-1].gradient_steps
     assert last == fitted.best.gradient_steps + 30
     assert fitted.stopped == 'early: the held-out loss has not fallen for 30 gradient steps'
+
+
+def test_ctrl_c_keeps_the_best_weights_so_far(tmp_path):
+    bags, found = prepared(tmp_path)
+    plan = fitting.plan(found, tiny(), how())
+
+    def interrupt(check):
+        if check.gradient_steps == 20:
+            raise KeyboardInterrupt
+
+    fitted = fitting.fit(bags, plan, SIZES, tiny(), how(), interrupt)
+
+    assert fitted.stopped == 'before its time, by Ctrl-C'
+    assert [check.gradient_steps for check in fitted.curve] == [0, 10, 20]
+    assert fitting.held_out_loss(fitted.method, fitted.held_out) == fitted.best.held_out_loss
+
+
+def test_training_that_diverges_keeps_the_best_weights_so_far(tmp_path):
+    huge = (
+        replace(r, value=r.value * 1e30) if isinstance(r, CompositeReward) else r
+        for r in records(20)
+    )
+    bag = Bag(write(tmp_path / 'bag', huge))
+    found = stretches(Index([bag]).read(), DELAY, 100).found
+    settings = tiny(target_scale='none')
+    plan = fitting.plan(found, settings, how())
+
+    fitted = fitting.fit([bag], plan, SIZES, settings, how())
+
+    assert 'reward_loss is inf at gradient step 0: training has diverged' in fitted.stopped
+    assert fitted.best.gradient_steps == fitted.method.gradient_steps == 0
 
 
 def test_the_same_seed_gives_the_same_weights_and_another_one_others(tmp_path):

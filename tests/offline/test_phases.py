@@ -47,6 +47,17 @@ def test_a_setting_that_the_run_did_not_have_is_said_and_teaches_something_else(
     assert said['recorded_labels']['same'] == 0
 
 
+def test_a_run_that_started_from_a_saved_model_is_folded_from_it(a_run, tmp_path):
+    said = fit(a_run.bag, tmp_path / 'own')
+
+    start = ['--checkpoint', str(tmp_path / 'own')]
+    frozen = fit(a_run.bag, tmp_path / 'frozen', *start, '--frozen')
+    assert frozen[DIGEST] == said[DIGEST]
+    live = fit(a_run.bag, tmp_path / 'live', *start)
+    assert live['gradient_steps'] == 2 * said['gradient_steps']
+    fit(a_run.bag, tmp_path / 'nothing', '--frozen', code=1)
+
+
 def test_a_bag_cut_after_a_commit_is_folded_up_to_there(a_run, tmp_path):
     ends = [i for i, r in enumerate(a_run.records) if isinstance(r, Commit)]
     bag = write(tmp_path / 'cut', a_run.records[: ends[2] + 1])

@@ -51,6 +51,22 @@ def _own_fields() -> list[tuple[str, Any, Any]]:
             f'{", ".join(config.PRESETS)} or a YAML file: the defaults of the settings below',
         ),
         field('run', str | None, None, 'ID', 'use this run only, where bags hold several'),
+        field(
+            'checkpoint',
+            str,
+            '',
+            'PATH',
+            'go on from this model: folder of a fit, of a run or of a checkpoint; with --schedule '
+            'phases the one that the run started from',
+        ),
+        (
+            'frozen',
+            Annotated[
+                bool,
+                tyro.conf.arg(help='the checkpoint only labelled in the run (--schedule phases)'),
+            ],
+            False,
+        ),
     ]
 
 
@@ -62,6 +78,8 @@ class Arguments:
     out: Path
     config: str | None
     run: str | None
+    checkpoint: str
+    frozen: bool
     fit: FitSettings
     settings: Settings
 
@@ -87,6 +105,8 @@ def parse(arguments: Sequence[str], base: Settings) -> Arguments:
         Path(mine['out']),
         mine['config'],
         mine['run'],
+        mine['checkpoint'],
+        mine['frozen'],
         config.validate(FitSettings, fitting, 'command line'),
         config.parse(base.model_dump() | values, 'command line'),
     )
@@ -97,30 +117,40 @@ def main(arguments: Sequence[str]) -> int:
     try:
         given = parse(arguments, config.load('quick'))
         run_folder.check(given.out)
-        from codetr_ros.rewards import RewardModelError
-
-        try:
-            return (_phases if given.fit.schedule == 'phases' else _epochs)(arguments, given)
-        except RewardModelError as error:
-            print(f'codetr: {error}', file=sys.stderr)
-            return FAILED
-    except (SettingsError, RunFolderError, FitError, BagError) as error:
+    except (SettingsError, RunFolderError) as error:
         return refuse(str(error))
+    from codetr_ros.checkpoints import CheckpointError
+    from codetr_ros.rewards import RewardModelError
+
+    try:
+        return (_phases if given.fit.schedule == 'phases' else _epochs)(arguments, given)
+    except (SettingsError, RunFolderError, FitError, BagError, CheckpointError) as error:
+        return refuse(str(error))
+    except RewardModelError as error:
+        print(f'codetr: {error}', file=sys.stderr)
+        return FAILED
 
 
 def _epochs(arguments: Sequence[str], given: Arguments) -> int:
     from codetr_ros import checkpoints
     from codetr_ros.offline import fitting, judging, report, results
     from codetr_ros.offline.episodes import stretches
+    from codetr_ros.rewards import saved
 
+    if given.frozen:
+        raise FitError('--frozen: a frozen model is not fitted; it is for --schedule phases')
+    start = saved.read(Path(given.checkpoint)) if given.checkpoint else None
     index, console = _index(given)
-    base = config.load(given.config) if given.config else index.base()
+    base = start.settings if start else index.base()
+    base = config.load(given.config) if given.config else base
     given = parse(arguments, base.changed(index.facts()))
     settings = given.settings
     _refuse_unfit(settings)
     longest = min(given.fit.stretch_steps, max(1, settings.memory_steps // 4))
     found = stretches(index, settings.delay, longest)
     plan = fitting.plan(found.found, settings, given.fit)
+    sizes = index.observation_size, index.action_size
+    method = saved.restore(start, settings, *sizes) if start else None
     folder = results.make_folder(given.out)
     run_folder.write_settings(folder, settings)
     console.print(
@@ -128,7 +158,6 @@ def _epochs(arguments: Sequence[str], given: Arguments) -> int:
         f'from in {plan.passes} {"part" if plan.passes == 1 else "parts"}, '
         f'{len(plan.held_out)} held out'
     )
-    sizes = index.observation_size, index.action_size
     fitted = fitting.fit(
         index.bags,
         plan,
@@ -136,6 +165,7 @@ def _epochs(arguments: Sequence[str], given: Arguments) -> int:
         settings,
         given.fit,
         lambda check: console.print(_line(check, given.fit), markup=False),
+        method,
     )
     meta = {
         'run_id': '',
@@ -220,6 +250,8 @@ def _phases(arguments: Sequence[str], given: Arguments) -> int:
         folder / run_folder.CHECKPOINTS,
         lambda text: console.print(text, style='yellow', markup=False),
         lambda phase, of: console.print(f'phase {phase} of {of}'),
+        given.checkpoint,
+        given.frozen,
     )
     seconds = time.perf_counter() - began
     found = stretches(index, own.delay, given.fit.stretch_steps)

@@ -62,8 +62,10 @@ class Fitted:
 
     method: rewards.RewardMethod  # with its best weights
     held_out: Loaded
+    begun_at: int = 0  # gradient steps of the model that it began with
     curve: list[Check] = field(default_factory=list)
     best: Check | None = None
+    kept: dict[str, torch.Tensor] | None = None  # the weights of the best look
     stopped: str = ''
     most_steps: int = 0  # held at any time
     reads: int = 0  # times that the bags were read, the index not counted
@@ -132,6 +134,7 @@ def fit(
     settings: Settings,
     how: FitSettings,
     say: Callable[[Check], None] = lambda check: None,
+    method: rewards.RewardMethod | None = None,
 ) -> Fitted:
     """Fit a reward method to what the plan says.
 
@@ -142,25 +145,52 @@ def fit(
         settings: method, its settings, seed, delay, memory_steps, threads.
         how: the schedule.
         say: is told of each look at the held-out data.
+        method: what is fitted, such as a restored one; a new one if None.
+
+    Returns:
+        The best weights that were found, also where training diverged or was interrupted
+        (Ctrl-C) after them: `stopped` says so.
 
     Raises:
         BagError: a bag cannot be read.
         FitError: a bag has changed meanwhile.
-        RewardModelError: training has diverged.
+        RewardModelError: training has diverged before anything was learnt.
     """
     torch.set_num_threads(settings.threads)
     began = time.perf_counter()
-    method = rewards.make(settings, *sizes)
+    method = method or rewards.make(settings, *sizes)
     held_out = load(bags, made.held_out, sizes, settings.delay, true_rewards=True)
-    found = Fitted(method, held_out, reads=1)
-    best: dict[str, torch.Tensor] | None = None
+    found = Fitted(method, held_out, method.gradient_steps, reads=1)
+    try:
+        _fit(bags, made, sizes, settings, how, found, say)
+    except (KeyboardInterrupt, rewards.RewardModelError) as error:
+        if found.kept is None:
+            raise
+        words = 'by Ctrl-C' if isinstance(error, KeyboardInterrupt) else str(error)
+        found.stopped = f'before its time, {words}'
+    if found.kept is not None:
+        method.load_state(found.kept)
+    found.seconds = time.perf_counter() - began
+    return found
+
+
+def _fit(
+    bags: Sequence[Bag],
+    made: Plan,
+    sizes: tuple[int, int],
+    settings: Settings,
+    how: FitSettings,
+    found: Fitted,
+    say: Callable[[Check], None],
+) -> None:
+    method = found.method
     for turn, part in parts(made, settings.seed):
         if turn and not isinstance(method, Learned):
             found.stopped = f'method {method.name} takes no gradient steps'
             break
         learnt = load(bags, part, sizes, settings.delay)
         found.reads += 1
-        steps = learnt.memory.steps + held_out.memory.steps
+        steps = learnt.memory.steps + found.held_out.memory.steps
         found.most_steps = max(found.most_steps, steps)
         method.prepare(learnt.memory)
         if not isinstance(method, Learned):
@@ -168,15 +198,11 @@ def fit(
         for check in _learn(method, learnt, found, settings, how, made.passes == 1):
             found.curve.append(check)
             if found.best is None or check.held_out_loss < found.best.held_out_loss:
-                found.best, best = check, method.state()
+                found.best, found.kept = check, method.state()
             say(check)
         del learnt  # before the next part takes its memory
         if found.stopped:
             break
-    if best is not None:
-        method.load_state(best)
-    found.seconds = time.perf_counter() - began
-    return found
 
 
 def _learn(
@@ -190,14 +216,15 @@ def _learn(
     """Gradient steps on one part; sets `stopped` where the fit is to end."""
     losses: list[float] = []
     if not found.curve:
-        yield Check(0, None, held_out_loss(method, found.held_out))
+        yield Check(found.begun_at, None, held_out_loss(method, found.held_out))
     while True:
         step = method.gradient_steps
         seed_torch(settings.seed, 'fit', step)
         said = method.gradient_step(learnt.memory, generator(settings.seed, 'fit', step))
         losses.append(said['reward_loss'])
-        done = method.gradient_steps >= how.gradient_steps
-        if done or method.gradient_steps % how.check_every == 0:
+        taken = method.gradient_steps - found.begun_at
+        done = taken >= how.gradient_steps
+        if done or taken % how.check_every == 0:
             yield Check(
                 method.gradient_steps,
                 float(np.mean(losses)),
@@ -214,7 +241,7 @@ def _learn(
                 )
             if found.stopped:
                 return
-        if not alone and method.gradient_steps % how.part_steps == 0:
+        if not alone and taken % how.part_steps == 0:
             return
 
 
@@ -229,7 +256,17 @@ def predictions(method: Learned, loaded: Loaded) -> np.ndarray:
 
 
 def held_out_loss(method: Learned, loaded: Loaded) -> float:
-    """Mean squared error of predicted composite rewards, in units of c squared."""
+    """Mean squared error of predicted composite rewards, in units of c squared.
+
+    Raises:
+        RewardModelError: it is not finite: training has diverged.
+    """
     true = loaded.memory.scores(loaded.memory.segment_ids())
     error = (predictions(method, loaded) - true) / method.target_scale
-    return float(np.mean(error**2))
+    loss = float(np.mean(error**2))
+    if not np.isfinite(loss):
+        raise rewards.RewardModelError(
+            f'the held-out loss is {loss} after {method.gradient_steps} gradient steps: training '
+            f'has diverged. Lower {method.group}.learning_rate'
+        )
+    return loss

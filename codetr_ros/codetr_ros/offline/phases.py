@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -90,7 +89,8 @@ def fold(
     folder: Path | None,
     say: Callable[[str], None] = lambda text: None,
     progress: Callable[[int, int], None] = lambda phase, phases: None,
-    **start: Any,
+    checkpoint: str = '',
+    frozen: bool = False,
 ) -> Fold:
     """Learn from a run's bag phase by phase.
 
@@ -101,13 +101,17 @@ def fold(
         folder: where checkpoints go; None keeps none.
         say: is told what was refused, and why.
         progress: is told the phases that are done, and how many the run has.
-        start: `checkpoint` and `frozen` of `Labeller`, if the run had them.
+        checkpoint: the saved model that the run started from; empty: it had none.
+        frozen: whether that one only labelled.
 
     Raises:
+        CheckpointError: there is no such checkpoint.
         FitError: something that a commit names is not in the bag.
+        RewardModelError: the checkpoint is of another method, size or shape, or training has
+            diverged.
     """
     torch.set_num_threads(settings.threads)
-    core = Labeller(run, settings, NODE, folder, **start)
+    core = Labeller(run, settings, NODE, folder, checkpoint, frozen)
     found = Fold(core, run, settings, 0, [], core.refused, Recorded())
     kinds = (*core.subscribes, StepRewards)
     work = core.work()
