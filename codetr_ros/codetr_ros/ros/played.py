@@ -76,7 +76,7 @@ class PlayedRole(Played):
     def __init__(
         self, role: str, name: str, recorded: Recorded, live: Collection[str], stop: Stop
     ) -> None:
-        super().__init__(role, name, lambda: lambda *_: _Silent(), stop)
+        super().__init__(role, name, lambda: lambda *_, **__: _Silent(), stop)
         self.log.set_level(LoggingSeverity.WARN)  # the player says the rest once
         self._recorded = recorded
         self._live = live
