@@ -277,8 +277,8 @@ def table(rows: list[dict[str, object]], load_before: float) -> str:
         '|---|---|---:|---:|---:|---:|---:|',
     ]
     lines += [
-        f'| {r["what"]} | {r["by"]} | {r["observations"]} | {r["seconds"]:.1f} | {r["cpu_s"]:.1f} | '
-        f'{r["steps_per_s"]:,} | {r["MB_per_s"]:.0f} |'
+        f'| {r["what"]} | {r["by"]} | {r["observations"]} | {r["seconds"]:.1f} | '
+        f'{r["cpu_s"]:.1f} | {r["steps_per_s"]:,} | {r["MB_per_s"]:.0f} |'
         for r in rows
     ]
     return '\n'.join(lines) + '\n'

@@ -175,6 +175,26 @@ def test_what_is_wrong_is_named(fault, tmp_path):
     assert any(re.search(said, text) for text in found), found
 
 
+def early_commit():
+    """The run, with a commit before the last score that it names."""
+    at = next(i for i, record in enumerate(RUN) if isinstance(record, Commit))
+    return [*RUN[: at - 1], RUN[at], RUN[at - 1], *RUN[at + 1 :]]
+
+
+def test_our_recorder_writes_a_commit_behind_what_it_names(tmp_path):
+    (said,) = named(ours(tmp_path / 'bag', early_commit()), 'commit')
+    assert "names composite rewards 3 of 'sim', the newest before it is 2" in said
+
+
+def test_a_recorder_of_others_may_write_topics_as_they_happen_to_arrive(tmp_path):
+    verdict = verify(WRITERS['rosbags-mcap'](tmp_path / 'bag', early_commit()))
+    (run,) = verdict.runs.values()
+    assert verdict.sound and run.whole == 3
+    never = changed(RUN, 1, Commit, transitions=np.array([90]))
+    found = named(WRITERS['rosbags-mcap'](tmp_path / 'never', never), 'commit')
+    assert any('names transitions 90' in text for text in found)
+
+
 def test_labels_in_parts_are_sound(tmp_path):
     parts = [replace(LABELS, part=n, parts=2) for n in (0, 1)]
     assert verify(ours(tmp_path / 'bag', [*RUN, *parts, replace(LABELS, phase=2)])).sound

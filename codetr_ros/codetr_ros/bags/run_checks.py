@@ -28,13 +28,25 @@ from codetr_ros.records import (
 
 
 class RunChecks:
-    """Everything with one run id in one namespace."""
+    """Everything with one run id in one namespace.
 
-    def __init__(self, namespace: str, run_id: str, findings: Findings) -> None:
+    Args:
+        namespace: of the run's topics.
+        run_id: its id.
+        findings: are added to.
+        ordered: a commit comes behind all that it names, as our recorder writes it. Others write
+            what they receive, in the order in which topics happen to arrive.
+    """
+
+    def __init__(
+        self, namespace: str, run_id: str, findings: Findings, ordered: bool = True
+    ) -> None:
         self.name = f'run {run_id!r} in {namespace}'
         self.sources: dict[str, SourceChecks] = {}
         self.phases = 0  # committed
         self.whole = 0  # phases, from the first on, of which everything named is there
+        self._ordered = ordered
+        self._waiting: list[tuple[Commit, Any]] = []  # for what they name
         self._scorers: dict[str, Numbers] = {}
         self._findings = findings
         self._run: RunSpec | None = None
@@ -47,7 +59,7 @@ class RunChecks:
             Transitions: lambda record, place: self._source(record).transitions(record, place),
             TrueRewards: lambda record, place: self._source(record).true_rewards(record, place),
             CompositeReward: self._score,
-            Commit: self._commit,
+            Commit: lambda record, place: self._waiting.append((record, place)),
             StepRewards: self._labels,
             Policy: self._policy,
             EpisodeResult: self._result,
@@ -58,6 +70,21 @@ class RunChecks:
         check = self._take.get(entry.kind)
         if check is not None:
             check(entry.record, entry.place)
+        while self._waiting and (self._ordered or self._arrived(self._waiting[0][0])):
+            self._commit(*self._waiting.pop(0))
+
+    def _arrived(self, commit: Commit) -> bool:
+        """Whether the newest of everything that a commit names is there."""
+        numbers = {name: source.numbers for name, source in self.sources.items()}
+        named = (
+            (commit.sources, commit.transitions, numbers),
+            (commit.scorers, commit.scores, self._scorers),
+        )
+        return all(
+            last < 0 or (name in there and last < there[name].next)
+            for names, newest, there in named
+            for name, last in zip(names, newest.tolist(), strict=True)
+        )
 
     def _source(self, record: Any) -> SourceChecks:
         if record.source not in self.sources:
@@ -206,6 +233,8 @@ class RunChecks:
 
     def finish(self, place: Any) -> None:
         """Say what never came, and what is only worth saying."""
+        for commit in self._waiting:
+            self._commit(*commit)
         for source in self.sources.values():
             source.finish(self.phases > 0, place)
             if self.phases and source.tail:

@@ -108,7 +108,7 @@ def verify(path: Path | str) -> Verdict:
             continue
         namespace, run_id = key = namespace_of(entry), entry.record.run_id
         if key not in runs:
-            runs[key] = RunChecks(namespace, run_id, findings)
+            runs[key] = RunChecks(namespace, run_id, findings, raw.channel.numbered)
             if first.setdefault(namespace, run_id) != run_id:
                 text = f'two runs are mixed in {namespace}: {first[namespace]!r} and {run_id!r}'
                 findings.add('run', entry.place, text)
