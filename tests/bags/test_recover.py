@@ -140,6 +140,22 @@ def test_bags_without_checksums_are_kept_too(tmp_path):
     assert kept == whole[: len(kept)] and len(kept) > 10
 
 
+def test_rows_behind_a_damaged_page_of_a_database_are_kept(tmp_path):
+    bag = WRITERS['rosbags-sqlite-9'](tmp_path / 'bag', a_run(phases=60))
+    path = bag / 'bag.db3'
+    whole = messages(bag)
+    data = bytearray(path.read_bytes())
+    page = data.index(whole[len(whole) // 2][-1]) // 4096 * 4096
+    data[page : page + 4096] = bytes(4096)
+    path.write_bytes(data)
+    found = recover(bag, tmp_path / 'new')
+    kept = messages(tmp_path / 'new')
+    assert len(whole) - 40 < len(kept) < len(whole)
+    assert [m for m in whole if m in kept] == kept and kept[-1] == whole[-1]
+    assert any('cannot be read' in damage.text for damage in found.said)
+    assert not found.verdict.sound
+
+
 def test_nothing_is_written_where_nothing_can_be_read_or_something_is(tmp_path):
     (tmp_path / 'bag.mcap').write_bytes(b'')
     with pytest.raises(BagError, match='no message of .* can be read.*is empty'):

@@ -14,6 +14,9 @@ from codetr_ros.bags.errors import BagError, Damage, Place
 from codetr_ros.bags.mcap_file import Channel, OnDamage, RawMessage
 from codetr_ros.bags.mcap_layout import LARGEST_RECORD
 
+_DAMAGED = (sqlite3.Error, UnicodeDecodeError, OverflowError)
+_FARTHEST = 1 << 40  # rows beyond a damaged one at which to look for the next
+
 
 class SqliteFile:
     """Reads one file; with the attributes of `McapFile`.
@@ -52,7 +55,6 @@ class SqliteFile:
             BagError: the file cannot be opened, is no such database, or is damaged (unless that is
                 told to `on_damage`).
         """
-        row = 0
         try:
             size = self.path.stat().st_size
             if not size:
@@ -60,30 +62,57 @@ class SqliteFile:
             connection = self._connect()
             try:
                 self._channels = _channels(connection)
-                # what claims more than the file has is not even asked for
-                rows = connection.execute(
-                    'SELECT id, topic_id, timestamp, length(data), '
-                    'CASE WHEN length(data) <= ? THEN data END FROM messages ORDER BY id',
-                    (min(size, LARGEST_RECORD),),
-                )
-                for number, topic, time, length, data in rows:
-                    row = number
-                    channel = self._channels.get(topic)
-                    if channel is None or not isinstance(data, bytes) or type(time) is not int:
-                        self._say(
-                            row, f'this is no message of a topic it knows: {topic!r}', length
-                        )
-                        continue
-                    self.counts[channel.topic] += 1
-                    self.unchecked += 1
-                    yield RawMessage(channel, time, time, 0, data, Place(self.shown, row))
-                self.finished = True
+                yield from self._rows(connection, min(size, LARGEST_RECORD))
             finally:
                 connection.close()
         except OSError as error:
             raise BagError(f'{self.shown} cannot be read: {error.strerror}') from error
-        except (sqlite3.Error, UnicodeDecodeError, OverflowError) as error:
-            self._say(row, f'the database is damaged here or behind it: {error}', 0)
+        except _DAMAGED as error:
+            self._say(0, f'the database is damaged: {error}', 0)
+
+    def _rows(self, connection: sqlite3.Connection, most: int) -> Iterator[RawMessage]:
+        """The messages; behind rows that cannot be read it goes on at the next that can."""
+        row = 0
+        while True:
+            try:
+                for message in self._rows_after(connection, row, most):
+                    row = message.place.offset
+                    yield message
+            except _DAMAGED as error:
+                following = _next_row(connection, row, most)
+                until = f'{following - 1}' if following else 'the last'
+                self._say(
+                    row + 1,
+                    f'rows {row + 1} to {until} cannot be read, if there are any: {error}',
+                    0,
+                )
+                if following is None:
+                    return
+                row = following - 1
+            else:
+                self.finished = True
+                return
+
+    def _rows_after(
+        self, connection: sqlite3.Connection, row: int, most: int
+    ) -> Iterator[RawMessage]:
+        # what claims more than the file has is not even asked for
+        rows = connection.execute(
+            'SELECT id, topic_id, timestamp, length(data), '
+            'CASE WHEN length(data) <= ? THEN data END FROM messages WHERE id > ? ORDER BY id',
+            (most, row),
+        )
+        for number, topic, time, length, data in rows:
+            if number <= row:
+                raise sqlite3.DatabaseError(f'row {number} follows row {row}')
+            row = number
+            channel = self._channels.get(topic)
+            if channel is None or not isinstance(data, bytes) or type(time) is not int:
+                self._say(row, f'this is no message of a topic it knows: {topic!r}', length)
+                continue
+            self.counts[channel.topic] += 1
+            self.unchecked += 1
+            yield RawMessage(channel, time, time, 0, data, Place(self.shown, row))
 
     def _say(self, row: int, text: str, lost: int) -> None:
         damage = Damage(Place(self.shown, row), text, lost or 0)
@@ -99,6 +128,35 @@ class SqliteFile:
         left = journal.exists() and journal.stat().st_size
         how = 'mode=ro' if left else 'mode=ro&immutable=1'
         return sqlite3.connect(f'file:{quote(str(self.path))}?{how}', uri=True)
+
+
+def _next_row(connection: sqlite3.Connection, row: int, most: int) -> int | None:
+    """The first row behind a damaged one that can be read, None if there is none: looked for at
+    doubling distances, then halved back.
+    """
+
+    def readable(number: int) -> tuple[bool, int | None]:
+        """Whether the row from this number on can be read, and which that is."""
+        try:
+            found = connection.execute(
+                'SELECT id, CASE WHEN length(data) <= ? THEN data END FROM messages '
+                'WHERE id >= ? ORDER BY id LIMIT 1',
+                (most, number),
+            ).fetchone()
+        except _DAMAGED:
+            return False, None
+        return True, found and found[0]
+
+    step = 1
+    while not readable(row + 1 + step)[0]:
+        step *= 2
+        if step > _FARTHEST:
+            return None
+    low, high = row + 1 + step // 2, row + 1 + step
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if readable(middle)[0] else (middle, high)
+    return readable(high)[1]
 
 
 def _columns(connection: sqlite3.Connection, table: str) -> set[str]:
