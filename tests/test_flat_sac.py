@@ -1,11 +1,16 @@
 """The fast update, held against the plain form and, for its gradients, against autograd."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import safetensors.torch
 import torch
 from test_sac import crooked, double, same  # noqa: F401  a fixture
 
+from codetr_ros.checkpoints import digest
 from codetr_ros.config import SacSettings
 from codetr_ros.learners import flat_sac
 from codetr_ros.learners.flat_sac import FlatSAC
@@ -31,6 +36,7 @@ def settings(hidden: tuple[int, ...] = (24, 16), batch: int = 32) -> SacSettings
         discount=0.9,
         tau=0.05,
         initial_temperature=0.5,
+        compile=False,
     )
 
 
@@ -205,3 +211,45 @@ def test_the_actor_that_is_published_is_the_one_that_learns():
     assert weights_bytes(sac.actor) != before
     changed = {n for n, tensor in sac.state().items() if not torch.equal(tensor, state[n])}
     assert changed == state.keys()
+
+
+def compiled_pair(hidden, observation, action, batch) -> tuple[SAC, FlatSAC]:
+    chosen = settings(hidden, batch)
+    fast = FlatSAC(observation, action, chosen.model_copy(update={'compile': True}), 3)
+    return SAC(observation, action, chosen, 3), fast
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(('hidden', 'observation', 'action', 'batch'), [SIZES[0], SIZES[2]])
+def test_a_hundred_compiled_updates_end_where_those_of_the_plain_form_end(
+    hidden, observation, action, batch
+):
+    plain, flat = compiled_pair(hidden, observation, action, batch)
+    assert same(plain.state(), flat.state())  # compiling left nothing behind
+    for index in range(100):
+        said = []
+        for sac in (plain, flat):
+            torch.manual_seed(index)
+            said.append(sac.update(make_batch(batch, observation, action, index)))
+        torch.testing.assert_close(said[1], said[0], rtol=1e-4, atol=1e-4)
+    check_close(flat, plain, 1e-4)
+
+
+COMPILED_BURST = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from test_flat_sac import compiled_pair, SIZES, burst, make_batch
+from codetr_ros.checkpoints import digest
+_, sac = compiled_pair(*SIZES[0])
+burst(sac, 64, make_batch(32 * 64, 5, 3, 0))
+print(digest(sac.state()))
+"""
+
+
+@pytest.mark.slow
+def test_compiled_updates_make_the_same_bits_in_another_process():
+    _, sac = compiled_pair(*SIZES[0])
+    burst(sac, 64, make_batch(32 * 64, 5, 3, 0))
+    command = [sys.executable, '-c', COMPILED_BURST, str(Path(__file__).parent)]
+    said = subprocess.run(command, capture_output=True, text=True, check=True, timeout=250)
+    assert said.stdout.split()[-1] == digest(sac.state())

@@ -238,6 +238,12 @@ class SacSettings(Group):
     burst: int = Field(
         50, ge=1, le=100_000, description='updates between two looks at arriving messages'
     )
+    compile: bool = Field(
+        True,
+        description='compile the update for this processor: faster, but needs a C++ compiler, and '
+        'the first start takes about half a minute more, later ones some seconds (what was '
+        'compiled is kept in ~/.cache/codetr_ros/torch)',
+    )
 
 
 class HcSettings(Group):

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
+from codetr_ros import compilation
 from codetr_ros.records import PROTOCOL_VERSION
 from codetr_ros.summary import version_of
 
@@ -186,6 +187,16 @@ def torch() -> list[Check]:
     return checks
 
 
+def compiler() -> Check:
+    """What `sac.compile` needs."""
+    lacking = compilation.missing()
+    if lacking:
+        remedy = f'{compilation.REMEDY}; without, set sac.compile=false'
+        return Check('C++ compiler', 'warn', lacking, remedy)
+    found = f'{compilation.command()}, compiled functions are kept in {compilation.cache_folder()}'
+    return Check('C++ compiler', 'ok', found)
+
+
 def simulators() -> Check:
     """MuJoCo and what is built on it."""
     versions = {name: version_of(name) for name in ('mujoco', 'gymnasium', 'dm-control')}
@@ -213,6 +224,7 @@ CHECKS: tuple[Callable[[], Check | list[Check]], ...] = (
     leftovers,
     shared_memory,
     torch,
+    compiler,
     simulators,
 )
 

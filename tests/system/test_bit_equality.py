@@ -82,6 +82,15 @@ def test_a_learner_of_scores_ends_with_the_same_weights_without_a_reward_node(
     assert topics['lost'] == topics['refused'] == 0
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(600)  # an empty cache costs half a minute of computing, twice
+def test_compiled_updates_are_the_same_in_another_process(tmp_path):
+    settings = tiny(sac__compile=True)
+    calls = by_calls(settings)  # first: the node then finds in the cache what it needs
+    topics, _ = train(settings, tmp_path / 'topics')
+    check_same(topics, calls)
+
+
 def test_two_simulators_over_topics_equal_two_in_process(tmp_path):
     settings = tiny(simulators=2, task=REACHER)
     topics, _ = train(settings, tmp_path / 'topics')

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim.adam import adam
 
+from codetr_ros.compilation import compiled
 from codetr_ros.config import SacSettings
 from codetr_ros.learners.network import LOG_STD_RANGE
 from codetr_ros.learners.sac import SAC, Adam, squashed_gaussian
@@ -55,6 +56,19 @@ class FlatSAC(SAC):
         self._flat_target = self._critic.flat.clone()
         self.target = self._critic.views(self._flat_target)
         self._sums = torch.zeros(len(METRICS))
+        self._step = self._update
+        if settings.compile:
+            self._compile(observation_size, action_size)
+
+    @torch.no_grad()
+    def _compile(self, observation_size: int, action_size: int) -> None:
+        """Have the update compiled, by one of which nothing remains."""
+        s, a = torch.zeros(self.batch, observation_size), torch.zeros(self.batch, action_size)
+        example = (s, a, s[:, 0].clone(), s, s[:, 0].clone(), torch.zeros(2, *a.shape))
+        state = self.state()
+        self._step = compiled(self._update, example, without='sac.compile=false')
+        self.load_state(state)
+        self._sums.zero_()
 
     def update(self, batch: StepBatch) -> dict[str, Tensor]:
         """One update of everything, as `SAC.update`."""
@@ -92,7 +106,7 @@ class FlatSAC(SAC):
         noise = torch.randn(updates, 2, len(a) // updates, a.shape[1], dtype=a.dtype)
         shares = (part.view(updates, -1, *part.shape[1:]) for part in (s, a, r, s2, going_on))
         for share in zip(*shares, noise, strict=True):
-            self._update(*share)
+            self._step(*share)
 
     def _update(
         self, s: Tensor, a: Tensor, r: Tensor, s2: Tensor, going_on: Tensor, noise: Tensor
@@ -199,6 +213,7 @@ class FlatAdam(Adam):
 
     def descend(self, gradients: Sequence[Tensor]) -> None:
         """One step down these gradients: as many numbers as parameters, in their order."""
+        compiling = torch.compiler.is_compiling()  # the fused form cannot be, but need not be
         adam(
             [self.flat],
             [torch.cat([g.reshape(-1) for g in gradients])],
@@ -206,7 +221,9 @@ class FlatAdam(Adam):
             [self.square],
             [],
             [self.count],
-            fused=True,
+            foreach=False,
+            fused=not compiling,
+            capturable=compiling,
             amsgrad=False,
             beta1=0.9,
             beta2=0.999,

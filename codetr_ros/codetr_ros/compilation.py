@@ -1,0 +1,84 @@
+"""Compiling torch functions for this processor: they become C++, and a C++ compiler builds it.
+
+What was built is kept and found again by the next run, in `cache_folder()`. This module imports
+torch only when something is compiled, so that `codetr doctor` can ask what is missing.
+"""
+
+import os
+import shutil
+import sys
+import sysconfig
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+REMEDY = 'install a C++ compiler and Python headers (Debian, Ubuntu: apt install g++ python3-dev)'
+_CACHE = 'TORCHINDUCTOR_CACHE_DIR'
+_Function = TypeVar('_Function', bound=Callable[..., object])
+
+
+class CompilationError(RuntimeError):
+    """Nothing can be compiled here: says why, what to install and how to do without."""
+
+
+def cache_folder() -> Path:
+    """Where compiled functions are kept: where torch's variable says, else in the user's cache."""
+    said = os.environ.get(_CACHE)
+    if said:
+        return Path(said)
+    caches = os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache'
+    return Path(caches, 'codetr_ros', 'torch')
+
+
+def command() -> str:
+    """The C++ compiler that torch calls."""
+    return os.environ.get('CXX') or ('clang++' if sys.platform == 'darwin' else 'g++')
+
+
+def missing() -> str:
+    """What is needed to compile and is not here; empty if everything is."""
+    if shutil.which(command()) is None:
+        said = ' (environment variable CXX)' if os.environ.get('CXX') else ''
+        return f'there is no C++ compiler {command()!r}{said}'
+    header = Path(sysconfig.get_path('include'), 'Python.h')
+    if not header.is_file():
+        return f'the header {header} is missing'
+    return ''
+
+
+def compiled(function: _Function, example: Sequence[Any], without: str) -> _Function:
+    """The same function, compiled for arguments of the shapes of an example.
+
+    Args:
+        function: of tensors, without branches that depend on their values.
+        example: its arguments; it is called with them.
+        without: the setting that makes do without compiling, and its value: for the error.
+
+    Raises:
+        CompilationError: a compiler or a header is missing, or the compiler failed.
+    """
+    lacking = missing()
+    if lacking:
+        raise CompilationError(f'{lacking}: {REMEDY}, or set {without}')
+    os.environ.setdefault(_CACHE, str(cache_folder()))
+    import torch
+    from torch._dynamo.exc import TorchDynamoException
+
+    options: dict[str, Any] = {
+        'fullgraph': True,
+        'dynamic': False,
+        'isolate_recompiles': True,  # as often as there are learners in this process
+        # One C++ file for all, the calls of matrix products included: it is built sooner than a
+        # file for each kernel, and Python has nothing left to do between them.
+        'options': {'cpp_wrapper': True},
+    }
+    result = cast(_Function, torch.compile(function, **options))
+    try:
+        result(*example)
+    except TorchDynamoException as error:
+        said = str(error).split('Set TORCHDYNAMO_VERBOSE')[0].strip()
+        raise CompilationError(
+            f'torch could not compile {function.__qualname__}: {REMEDY}, or set {without}. '
+            f'It said: {said[-2000:]}'
+        ) from error
+    return result
