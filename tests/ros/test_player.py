@@ -65,16 +65,31 @@ def test_a_phase_that_a_node_lacks_is_sent_again(ros_domain, tmp_path):
     assert '/r/reward lacks something of phase 0: sending it again' in said
 
 
-def test_a_node_that_stops_amid_the_bag_is_named(ros_domain, tmp_path):
+GONE = [
+    pytest.param(
+        signal.SIGINT, 'reward /r/reward stopped before everything was played', id='ended'
+    ),
+    pytest.param(
+        signal.SIGKILL,
+        'waits for reward, to have learnt from phase 0, and reward /r/reward has been silent',
+        id='killed',
+        marks=pytest.mark.slow,
+    ),
+]
+
+
+@pytest.mark.parametrize(('number', 'what'), GONE)
+def test_a_node_that_is_gone_amid_the_bag_is_named(ros_domain, tmp_path, number, what):
     bag = ours(tmp_path / 'bag', uniform())
-    with process('deaf') as deaf, player(bag) as node:
+    with process('deaf') as deaf, player(bag, '--deadline', '25') as node:
         for line in node.stdout:
             if 'phase 0 is played' in line:
                 break
-        deaf.send_signal(signal.SIGINT)
+        deaf.send_signal(number)
         said = output(node)
     assert node.returncode == 1
-    assert 'reward /r/reward stopped before everything was played: it waits for reward, to' in said
+    assert what in said
+    assert 'Traceback' not in said
 
 
 def test_a_learner_of_another_run_is_refused_naming_both_values(ros_domain, tmp_path):
