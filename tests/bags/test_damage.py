@@ -12,7 +12,7 @@ import os
 from pathlib import Path
 
 import pytest
-from bags.damage import CHECKED, KINDS, MEMORY, RUN, Tally, run_cases, table
+from bags.damage import CHECKED, KINDS, MEMORY, ORDERLY, RUN, Tally, run_cases, table
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -42,6 +42,8 @@ def test_damage_is_named_or_changes_nothing(kind, made_by, tmp_path):
     assert tally.peak < MEMORY
     if made_by in CHECKED or kind in ('a wrong definition', 'an empty file', 'no permission'):
         assert not tally.missed
+    if made_by in CHECKED and kind in ORDERLY:
+        assert not tally.late
 
 
 @given(st.data())

@@ -2,6 +2,7 @@ import shutil
 import subprocess
 import sys
 import textwrap
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -91,6 +92,16 @@ def test_a_split_that_is_missing_is_named(tmp_path):
         Bag(bag)
 
 
+def test_a_chunk_that_is_gone_without_a_trace_is_missed_at_the_files_end(tmp_path):
+    bag = ours(tmp_path / 'bag', a_run())
+    path = bag / 'bag_0.mcap'
+    data = path.read_bytes()
+    a, b = sorted({entry.place.offset for entry in Bag(bag).entries()})[1:3]
+    path.write_bytes(data[:a] + data[b:])
+    with pytest.raises(BagError, match='the file counts 44 messages, .* were read'):
+        read(bag)
+
+
 def test_a_bag_becomes_the_memory_that_the_run_had(tmp_path):
     records = a_run()
     live, again = (Trajectories(3, 2, 5, 1000, 100) for _ in range(2))
@@ -105,6 +116,23 @@ def test_a_bag_becomes_the_memory_that_the_run_had(tmp_path):
 def test_arrays_are_writeable_memory_of_our_own(tmp_path):
     chunk = read(ours(tmp_path / 'bag', a_run()), [Transitions])[0]
     assert chunk.observations.flags.writeable and chunk.observations.flags.aligned
+
+
+def test_a_bag_is_read_in_the_memory_of_a_chunk(tmp_path):
+    steps = 2000
+    chunk = Transitions(
+        'run', 'sim', 0, 0, 0, 0, steps, np.zeros((steps + 1, 100), np.float32),
+        np.zeros((steps, 1), np.float32), False, False, False, 0,
+    )  # fmt: skip
+    bag = ours(tmp_path / 'bag', [chunk] * 40)
+    assert sum(path.stat().st_size for path in bag.iterdir()) > 30e6
+    next(Bag(bag).entries())  # what is kept for good: definitions
+    tracemalloc.start()
+    try:
+        assert sum(1 for _ in Bag(bag).entries()) == 40
+        assert tracemalloc.get_traced_memory()[1] < 6e6
+    finally:
+        tracemalloc.stop()
 
 
 def test_the_library_reads_bags_where_ros_is_absent(tmp_path):

@@ -175,6 +175,13 @@ def test_what_is_wrong_is_named(fault, tmp_path):
     assert any(re.search(said, text) for text in found), found
 
 
+@pytest.mark.timeout(30)
+@pytest.mark.parametrize('field', ['episode', 'first_step', 'phase', 'sequence'])
+def test_a_wild_number_takes_neither_time_nor_memory(field, tmp_path):
+    wild = changed(RUN, 3, Transitions, **{field: 4_000_000_000})
+    assert not verify(ours(tmp_path / 'bag', wild)).sound
+
+
 def early_commit():
     """The run, with a commit before the last score that it names."""
     at = next(i for i, record in enumerate(RUN) if isinstance(record, Commit))

@@ -8,8 +8,9 @@ from pathlib import Path, PurePath
 
 import yaml
 
+from codetr_ros.bags import metadata
 from codetr_ros.bags.errors import BagError, Damage, Place
-from codetr_ros.bags.metadata import LONGEST, METADATA, load_yaml
+from codetr_ros.bags.metadata import METADATA
 
 STORAGES = ('.mcap', '.db3')
 COMPRESSED = '.zstd'
@@ -35,15 +36,13 @@ def listed_files(folder: Path) -> list[str]:
     """
     path = folder / METADATA
     try:
-        with path.open('rb') as file:
-            text = file.read(LONGEST)
-        said = load_yaml(text)['rosbag2_bagfile_information']['relative_file_paths']
+        said = metadata.read(folder)['relative_file_paths']
         return [PurePath(name).name for name in said]
     except FileNotFoundError:
         return []
     except OSError as error:
         raise BagError(f'{path} cannot be read: {error.strerror}') from error
-    except (yaml.YAMLError, UnicodeDecodeError, LookupError, TypeError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError, LookupError, TypeError, RecursionError) as error:
         raise BagError(
             f'{path} is damaged ({str(error).splitlines()[0]}). The messages do not need it: '
             'remove it, or make a new one with `codetr bag recover`'
