@@ -50,6 +50,16 @@ def test_a_frozen_model_labels_as_it_was_saved_and_each_segment_once(tmp_path):
     assert np.array_equal(said[1][0].labels[: len(expected)], expected)
 
 
+def test_a_frozen_rule_keeps_what_it_knew_of_scores(tmp_path):
+    """IRCR learns extremes, not weights: it must not look at new scores either."""
+    before, _ = trained(tmp_path, method='ircr')
+    core, _ = served(checkpoints.latest(tmp_path, 'reward'), frozen=True, phases=5, method='ircr')
+    live, _ = served(checkpoints.latest(tmp_path, 'reward'), phases=5, method='ircr')
+
+    digests = [c.report()['reward_model_sha256'] for c in (before, core, live)]
+    assert digests[0] == digests[1] != digests[2]
+
+
 def test_a_live_model_goes_on_learning_from_where_it_was_saved(tmp_path):
     before, _ = trained(tmp_path)
     core, said = served(checkpoints.latest(tmp_path, 'reward'), phases=2)

@@ -115,6 +115,20 @@ def test_the_last_step_is_as_long_as_the_one_before_however_long_nothing_comes()
     assert steps[0][2] == [1.0, 1.1, 5.0]
 
 
+def test_the_only_step_of_an_episode_lasts_until_its_end():
+    steps, _, _ = run(
+        rules(),
+        *commands(1.0, 1.1),
+        said(1.15, '/state', [5.0]),
+        said(1.2, '/end'),
+        *commands(3.0),
+        said(3.05, '/state', [6.0]),
+        said(3.15, '/state', [7.0]),
+        said(3.2, '/end'),
+    )
+    assert steps[1][:3] == (1, 0, [3.0, 7.0])
+
+
 def test_a_last_step_after_which_nothing_was_observed_is_dropped():
     steps, scores, converter = run(
         rules(), *commands(1.0, 1.1), said(1.1, '/score', 2.0), said(1.1, '/end')

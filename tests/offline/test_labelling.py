@@ -95,6 +95,16 @@ def test_the_labels_of_the_runs_own_last_model_are_those_that_the_run_ended_with
     assert [new[k] for k in shared] == pytest.approx([last[k] for k in shared], rel=1e-4, abs=1e-5)
 
 
+def test_labels_that_a_run_has_recorded_are_succeeded_by_the_new_ones(a_run, fitted, tmp_path):
+    new = label(a_run.bag, fitted, tmp_path / 'new')
+
+    recorded = sum(isinstance(r, StepRewards) for r in a_run.records)
+    found = [entry.record for entry in Bag(new).entries((StepRewards,))]
+    assert min(r.phase for r in found[recorded:]) == a_run.settings.phases
+    assert max(r.phase for r in found[:recorded]) < a_run.settings.phases
+    assert [r.part for r in found[recorded:]] == list(range(found[-1].parts))
+
+
 def test_labels_do_not_depend_on_how_much_is_held_in_memory(a_run, fitted, tmp_path):
     whole = labels(label(a_run.bag, fitted, tmp_path / 'whole'))
     parts = labels(label(a_run.bag, fitted, tmp_path / 'parts', '--memory-steps', '60'))
