@@ -34,6 +34,7 @@ import time
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rosbags.highlevel import AnyReader
@@ -63,6 +64,8 @@ from codetr_ros.records import (
 from codetr_ros.trajectories import Trajectories
 
 PHASE, CHUNK, DELAY, ACTIONS = 1000, 500, 25, 8
+LOUD = 0.5
+"""Load average above which the machine is not idle."""
 COLUMNS = ('what', 'by', 'observations', 'steps', 'seconds', 'cpu_s', 'steps_per_s', 'MB_per_s')
 
 
@@ -195,11 +198,11 @@ def cut_short(folder: Path, new: Path) -> Path:
     return new
 
 
-def measure(steps: int, observations: int, folder: Path) -> Iterator[dict[str, object]]:
+def measure(steps: int, observations: int, folder: Path) -> Iterator[dict[str, Any]]:
     """Do everything once; one row for each."""
     size = 0
 
-    def row(what: str, by: str, watch: Stopwatch) -> dict[str, object]:
+    def row(what: str, by: str, watch: Stopwatch) -> dict[str, Any]:
         seconds = watch.seconds
         found = dict(
             zip(
@@ -215,7 +218,7 @@ def measure(steps: int, observations: int, folder: Path) -> Iterator[dict[str, o
         print(found, flush=True)
         return found
 
-    def timed(what: str, by: str, call: Callable[[], object]) -> dict[str, object]:
+    def timed(what: str, by: str, call: Callable[[], object]) -> dict[str, Any]:
         watch = Stopwatch()
         with watch:
             call()
@@ -261,17 +264,25 @@ def check_sound(folder: Path) -> None:
     assert verdict.sound, verdict.findings.named[:3]
 
 
-def table(rows: list[dict[str, object]], load_before: float) -> str:
+def circumstances() -> str:
+    """Of what, and where, this is measured."""
     commit = subprocess.run(
         ['git', 'rev-parse', '--short', 'HEAD'], capture_output=True, text=True, check=False
     ).stdout.strip()
     packages = ', '.join(f'{name} {version(name)}' for name in ('rosbags', 'mcap', 'numpy'))
+    load_average = os.getloadavg()[0]
+    busy = ': other work ran beside it, compare the CPU seconds' if load_average > LOUD else ''
+    return (
+        f'`benchmarks/bags.py` at {commit}, Python {platform.python_version()}, {packages}, '
+        f'{os.cpu_count()} cores, each once, load average {load_average:.1f} at the start{busy}.'
+    )
+
+
+def table(rows: list[dict[str, Any]], about: str) -> str:
     lines = [
         '# Bags: how fast',
         '',
-        f'`benchmarks/bags.py` at {commit}, Python {platform.python_version()}, {packages}, '
-        f'{os.cpu_count()} cores, load average {load_before:.1f} when it began: each once, so '
-        'read the ratios.',
+        about,
         '',
         '| | by | observations | seconds | CPU seconds | steps/s | MB/s |',
         '|---|---|---:|---:|---:|---:|---:|',
@@ -292,19 +303,19 @@ def main() -> None:
     parser.add_argument('--observations', type=int, nargs='+', default=[105, 27])
     parser.add_argument('--out', type=Path, help='folder for bags.csv and bags.md')
     given = parser.parse_args()
-    load_before = os.getloadavg()[0]
-    rows: list[dict[str, object]] = []
+    about = circumstances()
+    rows: list[dict[str, Any]] = []
     for observations in given.observations:
         with tempfile.TemporaryDirectory(prefix='codetr-bags-') as folder:
             rows += measure(given.steps, observations, Path(folder))
         if given.out:
-            save(given.out, rows, load_before)
-    print(table(rows, load_before))
+            save(given.out, rows, about)
+    print(table(rows, about))
 
 
-def save(folder: Path, rows: list[dict[str, object]], load_before: float) -> None:
+def save(folder: Path, rows: list[dict[str, Any]], about: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / 'bags.md').write_text(table(rows, load_before))
+    (folder / 'bags.md').write_text(table(rows, about))
     with (folder / 'bags.csv').open('w', newline='') as file:
         writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()
