@@ -57,7 +57,7 @@ import torch
 
 from codetr_ros import rewards, tasks
 from codetr_ros.config import Settings, load
-from codetr_ros.learners.sac import SAC
+from codetr_ros.learners.flat_sac import FlatSAC
 from codetr_ros.records import CompositeReward, StepRewards, Transitions
 from codetr_ros.rewards.method import segment_steps
 from codetr_ros.seeding import generator, seed_torch
@@ -99,9 +99,9 @@ class Parts:
         self.environment = tasks.make(settings.task)
         self.memory = filled_memory(settings, self.environment)
         sizes = self.environment.observation_size, self.environment.action_size
-        self.sac = SAC(*sizes, settings.sac, settings.seed)
+        self.sac = FlatSAC(*sizes, settings.sac, settings.seed)
         self.large = settings.changed({'sac.hidden': (256, 256), 'sac.batch': 256})
-        self.large_sac = SAC(*sizes, self.large.sac, settings.seed)
+        self.large_sac = FlatSAC(*sizes, self.large.sac, settings.seed)
         self.method = rewards.make(settings, *sizes)
         self.method.prepare(self.memory)
         self.rng = generator(settings.seed, 'throughput')
@@ -138,10 +138,9 @@ class Parts:
                 steps += 1
         return {'environment': steps / spent, 'step alone': steps / (spent - resetting)}
 
-    def update(self, sac: SAC, settings: Settings) -> int:
+    def update(self, sac: FlatSAC, settings: Settings) -> int:
         """Some SAC updates; how many."""
-        for _ in range(settings.sac.burst):
-            sac.update(self.memory.sample_steps(self.rng, settings.sac.batch))
+        sac.burst(settings.sac.burst, lambda rows: self.memory.sample_steps(self.rng, rows))
         return settings.sac.burst
 
     def gradient_step(self) -> int:

@@ -367,16 +367,16 @@ class Trajectories:
 
     @staticmethod
     def _steps(source: SourceRing, slots: NDArray[np.int64]) -> StepBatch:
-        following = source.observations[(slots + 1) % source.capacity]
+        following = source.observations.take((slots + 1) % source.capacity, 0)
         for i in np.flatnonzero(source.last[slots]):
             row = source.start + (int(slots[i]) - source.start) % source.capacity
             following[i] = source.finals[row]
         return StepBatch(
-            source.observations[slots],
-            source.actions[slots],
-            source.labels[slots],
+            source.observations.take(slots, 0),
+            source.actions.take(slots, 0),
+            source.labels.take(slots),
             following,
-            source.terminated[slots],
+            source.terminated.take(slots),
         )
 
     def segment_ids(self) -> I64:

@@ -27,6 +27,8 @@ METRICS = ('critic_loss', 'actor_loss', 'temperature', 'entropy', 'q_mean')
 """What `SAC.update` says, in the order in which it is summed here."""
 DRAWN_AT_ONCE = 64
 """Updates whose steps and noise are drawn in one go; more would take memory and save no time."""
+KEPT_BYTES = 31 << 20
+"""Just below 32 MB, from where on glibc draws no conclusions from a block."""
 
 
 class FlatSAC(SAC):
@@ -44,6 +46,7 @@ class FlatSAC(SAC):
             seed: of the initial weights; torch's global generator is seeded from it.
         """
         super().__init__(observation_size, action_size, settings, seed)
+        _keep_freed_memory()
         self.batch = settings.batch
         self.critic_adam = self._critic = FlatAdam(self.critic, settings.critic_learning_rate)
         self.actor_adam = self._actor = FlatAdam(
@@ -274,3 +277,13 @@ def slopes(
         if i > 1:
             gradient = found[0] @ network[2 * i - 2].mT
     return found
+
+
+def _keep_freed_memory() -> None:
+    """Have freed memory kept for the next update, where the C library is glibc.
+
+    After the free of a block of this size it serves blocks up to it from the heap, and gives back
+    to the system only what exceeds twice of it. Otherwise each update, and each draw of a batch,
+    would take its memory anew, at the price of a page fault for every 4 KB.
+    """
+    torch.empty(KEPT_BYTES, dtype=torch.uint8)  # never written to: it takes no memory
