@@ -378,8 +378,9 @@ def table(tallies: dict[tuple[str, str], Tally]) -> str:
         f'of {len(RUN)} messages at random, reads it, reads past its faults, and verifies it. '
         '*Late*: the reader had given out something else than was written before it refused. '
         f'Files of these writers carry CRCs: {", ".join(CHECKED)}; the others do not, and what is '
-        'changed in them can be another possible number. No case ended in anything but a named '
-        'error.',
+        'changed in them can be another possible number. The file of a killed recorder is refused '
+        'for its missing end in any case: there *late* is what counts. No case ended in anything '
+        'but a named error.',
         '',
         '| damage | bag written by | cases | refused by the reader | of these, late | '
         'found by `verify` | '
