@@ -146,10 +146,9 @@ class FlatSAC(SAC):
         q = values(critic, hidden)  # (2, B)
         error = q - y
         dq = (2 / B) * error.unsqueeze(-1)  # (2, B, 1)
+        by_layer = slopes(critic, hidden, dq * critic[-2].mT)
         gradients = [
-            g
-            for x, d in zip(hidden, slopes(critic, hidden, dq * critic[-2].mT), strict=False)
-            for g in (x.mT @ d, d.sum(1))
+            g for x, d in zip(hidden[:-1], by_layer, strict=True) for g in (x.mT @ d, d.sum(1))
         ]
         # the last one is (2, 1, H), the same numbers as (2, H, 1) and twelve times as fast
         self._critic.descend([*gradients, dq.mT @ hidden[-1], dq.sum(1)])
@@ -170,15 +169,10 @@ class FlatSAC(SAC):
         d_log_std = du * log_std[B:].exp() * noise[1] - alpha / B
         inside = (out[B:, A:] >= LOG_STD_RANGE[0]) & (out[B:, A:] <= LOG_STD_RANGE[1])
         d_out = torch.cat([du, d_log_std * inside], -1)[None]  # (1, B, 2A)
-        xs = [x[:, B:] for x in actor_hidden]
+        hidden = [x[:, B:] for x in actor_hidden]
+        by_layer = [*slopes(actor, hidden, d_out @ actor[-2].mT), d_out]
         gradients = [
-            g
-            for x, d in zip(
-                xs,
-                [*slopes(actor, xs, d_out @ actor[-2].mT), d_out],
-                strict=True,
-            )
-            for g in (d.mT @ x, d.sum(1))
+            g for x, d in zip(hidden, by_layer, strict=True) for g in (d.mT @ x, d.sum(1))
         ]
         self._actor.descend(gradients)
 
