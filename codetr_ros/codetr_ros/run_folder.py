@@ -139,6 +139,12 @@ def create(path: Path) -> Path:
     return folder
 
 
+def bag_of(path: Path) -> Path:
+    """The bag in a run's folder; any other path as it is."""
+    inside = path / BAG
+    return inside if (path / CONFIG).is_file() and inside.is_dir() else path
+
+
 def write_settings(folder: Path, settings: config.Settings) -> Path:
     """Write every setting to the run's `config.yaml`, from which `config.load` reads them."""
     path = folder / CONFIG

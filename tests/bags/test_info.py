@@ -36,6 +36,15 @@ def test_info_shows_tables_and_json(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)['runs'][0]['steps'] == 60
 
 
+@pytest.mark.parametrize('command', ['info', 'verify', 'recover'])
+def test_the_folder_of_a_run_stands_for_its_bag(command, tmp_path, capsys):
+    ours(tmp_path / 'run' / 'bag', a_run())
+    (tmp_path / 'run' / 'config.yaml').touch()
+    out = ['--out', str(tmp_path / 'new')] if command == 'recover' else []
+    assert main(['bag', command, str(tmp_path / 'run'), *out]) == 0, capsys.readouterr().err
+    assert str(tmp_path / 'run' / 'bag') in capsys.readouterr().out
+
+
 def test_faults_are_counted_and_said(tmp_path, capsys):
     bag = ours(tmp_path / 'bag', a_run())
     path = bag / 'bag_0.mcap'

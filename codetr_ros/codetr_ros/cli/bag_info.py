@@ -4,12 +4,14 @@ import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
+from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
 from rich.table import Table
 
+from codetr_ros import run_folder
 from codetr_ros.cli import refuse
 
 
@@ -18,7 +20,9 @@ class Arguments:
     """Say what is in a bag. It is read from end to end; damage is counted and read past."""
 
     bag: Annotated[
-        str, tyro.conf.Positional, tyro.conf.arg(metavar='BAG', help="the bag's folder or file")
+        Path,
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar='BAG', help="the bag's folder or file, or the folder of a run"),
     ]
     json: Annotated[bool, tyro.conf.arg(help='print JSON', name='json')] = False
 
@@ -32,7 +36,7 @@ def main(arguments: Sequence[str]) -> int:
     from codetr_ros.bags.info import survey
 
     try:
-        found = survey(given.bag)
+        found = survey(run_folder.bag_of(given.bag))
     except BagError as error:
         return refuse(str(error))
     if given.json:

@@ -3,12 +3,14 @@
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
 from rich.markup import escape
 
+from codetr_ros import run_folder
 from codetr_ros.cli import FAILED, refuse
 
 SHOWN = 20
@@ -25,7 +27,9 @@ class Arguments:
     """
 
     bag: Annotated[
-        str, tyro.conf.Positional, tyro.conf.arg(metavar='BAG', help="the bag's folder or file")
+        Path,
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar='BAG', help="the bag's folder or file, or the folder of a run"),
     ]
     out: Annotated[str, tyro.conf.arg(metavar='NEW', help='folder of the new bag')]
     json: Annotated[bool, tyro.conf.arg(help='print JSON', name='json')] = False
@@ -43,7 +47,7 @@ def main(arguments: Sequence[str]) -> int:
     from codetr_ros.bags.recover import recover
 
     try:
-        found = recover(given.bag, given.out)
+        found = recover(run_folder.bag_of(given.bag), given.out)
     except BagError as error:
         return refuse(str(error))
     if given.json:

@@ -4,12 +4,14 @@ import dataclasses
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
 from rich.markup import escape
 
+from codetr_ros import run_folder
 from codetr_ros.cli import FAILED, refuse
 
 
@@ -23,7 +25,9 @@ class Arguments:
     """
 
     bag: Annotated[
-        str, tyro.conf.Positional, tyro.conf.arg(metavar='BAG', help="the bag's folder or file")
+        Path,
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar='BAG', help="the bag's folder or file, or the folder of a run"),
     ]
     json: Annotated[bool, tyro.conf.arg(help='print JSON', name='json')] = False
     limit: Annotated[
@@ -40,7 +44,7 @@ def main(arguments: Sequence[str]) -> int:
     from codetr_ros.bags.verify import verify
 
     try:
-        verdict = verify(given.bag)
+        verdict = verify(run_folder.bag_of(given.bag))
     except BagError as error:
         return refuse(str(error))
     if given.json:

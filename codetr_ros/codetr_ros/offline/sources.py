@@ -20,8 +20,7 @@ def open_bags(paths: Sequence[Path]) -> list[Bag]:
     found = []
     seen: dict[Path, Path] = {}
     for path in paths:
-        inside = path / run_folder.BAG
-        bag = Bag(inside if (path / run_folder.CONFIG).is_file() and inside.is_dir() else path)
+        bag = Bag(run_folder.bag_of(path))
         if (real := bag.path.resolve()) in seen:
             raise FitError(
                 f'{path} is the same bag as {seen[real]}: its episodes would be learnt from and '
