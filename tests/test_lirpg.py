@@ -219,6 +219,16 @@ def test_a_state_of_other_settings_is_refused_and_changes_nothing() -> None:
     assert all(torch.equal(tensor, before[name]) for name, tensor in lirpg.state().items())
 
 
+def test_a_last_phase_of_a_single_step_does_not_spoil_what_was_learnt() -> None:
+    records: list = []
+    changes = {'steps': 201, 'phase_steps': 100, 'warmup_steps': 100, 'evaluate_every': 0}
+    in_process.run(tiny(method='lirpg', **changes), 'run', observe=records.append)
+    last = [record for record in records if isinstance(record, Policy)][-1]
+    weights = safetensors.torch.load(last.weights)
+    assert last.version == 2
+    assert all(tensor.isfinite().all() for tensor in weights.values())
+
+
 def test_it_is_refused_with_overlap() -> None:
     with pytest.raises(SettingsError, match='overlap=True with method=lirpg: it learns on-policy'):
         tiny(method='lirpg', overlap=True)

@@ -101,6 +101,15 @@ def test_normalised_advantages_have_mean_zero_and_deviation_one() -> None:
     assert float(found.square().mean()) == pytest.approx(1)
 
 
+def test_where_nothing_differs_or_moves_the_derivatives_are_numbers_all_the_same() -> None:
+    advantage = torch.tensor([3.0], requires_grad=True)  # a minibatch of one step
+    gradient = torch.zeros(2, requires_grad=True)
+    for value, of in ((normalised(advantage), advantage), (clipped([gradient], 0.5)[0], gradient)):
+        assert not value.detach().any()
+        (slope,) = torch.autograd.grad(value.sum(), of)
+        assert slope.isfinite().all()
+
+
 def memory() -> tuple[Trajectories, list]:
     held = Trajectories(OBS, ACT, DELAY, 40, 20)
     rng = np.random.default_rng(1)

@@ -87,16 +87,21 @@ def trace(indices: Tensor, stretch_ends: Tensor, decay: float) -> Tensor:
 
 
 def normalised(advantages: Tensor) -> Tensor:
-    """Advantages (B,) of mean 0 and standard deviation 1."""
+    """Advantages (B,) of mean 0 and standard deviation 1; all 0 where they are all the same."""
     centred = advantages - advantages.mean()
-    return centred / (centred.square().mean().sqrt() + 1e-8)
+    return centred / (_root(centred.square().mean()) + 1e-8)
 
 
 def clipped(gradients: Sequence[Tensor], norm: float) -> list[Tensor]:
     """Gradients whose norm, all together, is at most `norm`."""
-    total = torch.stack([gradient.square().sum() for gradient in gradients]).sum().sqrt()
+    total = _root(torch.stack([gradient.square().sum() for gradient in gradients]).sum())
     factor = norm / torch.clamp(total, min=norm)
     return [gradient * factor for gradient in gradients]
+
+
+def _root(square: Tensor) -> Tensor:
+    """The square root of a scalar, with a derivative of 0 at 0 in place of an infinite one."""
+    return square.clamp(min=torch.finfo(square.dtype).tiny).sqrt()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
