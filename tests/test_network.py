@@ -174,7 +174,7 @@ def test_the_moments_of_the_observations_travel_with_the_policy() -> None:
     actor = StandardisedActor(OBS, ACT, HIDDEN)
     with torch.no_grad():
         actor.mean.weight.mul_(100)
-        actor.log_std.copy_(torch.tensor([-1.0, 0.5, 0.0]))
+        actor.log_std.copy_(torch.tensor([-1.0, 0.5, 2.5]))  # the last is beyond the clip
         actor.observation_mean.copy_(torch.linspace(-1, 1, OBS))
         actor.observation_deviation.copy_(torch.linspace(0.01, 2, OBS))  # some beyond the clip
     kind = 'standardised_tanh_gaussian_mlp'
@@ -185,9 +185,12 @@ def test_the_moments_of_the_observations_travel_with_the_policy() -> None:
     mean, deviation = np.linspace(-1, 1, OBS), np.linspace(0.01, 2, OBS)
     x = torch.from_numpy(np.clip((seen - mean) / deviation, -10, 10)).float()
     assert x.abs().max() == 10
+    mean, log_std = actor(x)  # what the learner takes the policy for
+    assert log_std.tolist() == [-1.0, 0.5, 2.0]
     for layer in linear_layers(actor)[:-1]:
         x = torch.tanh(layer(x))
-    u = actor.mean(x) + actor.log_std.exp() * torch.from_numpy(noise)
+    torch.testing.assert_close(mean, actor.mean(x))
+    u = mean + log_std.exp() * torch.from_numpy(noise)
     acted = [policy.act(o, e) for o, e in zip(seen, noise, strict=True)]
     np.testing.assert_allclose(acted, u.tanh().detach().numpy(), atol=1e-5)
 

@@ -114,7 +114,7 @@ class StandardisedActor(nn.Module):
 
     def forward(self, observations: Tensor) -> tuple[Tensor, Tensor]:
         """Means (B, A) for standardised observations (B, O), and log standard deviations (A,)."""
-        return self.mean(self.body(observations)), self.log_std
+        return self.mean(self.body(observations)), self.log_std.clamp(*LOG_STD_RANGE)
 
 
 KINDS: dict[str, type[Actor | StandardisedActor]] = {
