@@ -15,8 +15,10 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from codetr_ros.bags.definitions import encode, own_types
 from codetr_ros.bags.errors import BagError
 from codetr_ros.bags.reader import Bag
+from codetr_ros.bags.topics import BagTopic
+from codetr_ros.bags.writer import McapWriter
 from codetr_ros.received import type_name
-from codetr_ros.records import TOPICS, Commit, Transitions
+from codetr_ros.records import TOPICS, Commit, RunSpec, Transitions
 from codetr_ros.trajectories import Trajectories
 
 
@@ -60,6 +62,18 @@ def test_an_entry_says_what_it_is_where_it_lies_and_when_it_was_written(tmp_path
         data = entry.place.file.read_bytes()
         assert data[entry.place.offset] == 6, 'a chunk begins there'
     assert 'bag_0.mcap byte' in str(entries[-1].place)
+
+
+def test_a_message_said_to_be_from_before_1970_is_as_published_when_received(
+    tmp_path,
+):
+    record = a_run()[0]
+    writer = McapWriter(tmp_path / 'bag', [BagTopic('/a/run', type_name(RunSpec), 1, False)])
+    writer.write('/a/run', encode(record, -(10**9)), 1000, -(10**9))
+    writer.close()
+    (entry,) = Bag(tmp_path / 'bag').entries()
+    assert (entry.log_time, entry.publish_time) == (1000, 1000)
+    assert same(entry.record, record)
 
 
 def test_only_the_kinds_asked_for_are_given_out(tmp_path):

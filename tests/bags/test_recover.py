@@ -1,19 +1,23 @@
 import json
 import os
+import sqlite3
 import subprocess
 import sys
 import textwrap
 
 import pytest
 from bags.making import WRITERS, a_run, by_mcap, ours
-from mcap.writer import CompressionType
+from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
+from codetr_ros.bags.definitions import encode
 from codetr_ros.bags.errors import BagError
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.recover import recover
+from codetr_ros.bags.topics import schema_text
 from codetr_ros.bags.verify import verify
 from codetr_ros.cli import main
+from codetr_ros.received import type_name
 from codetr_ros.records import Commit, RunSpec, Transitions, TrueRewards
 
 RUN = a_run()
@@ -154,6 +158,40 @@ def test_rows_behind_a_damaged_page_of_a_database_are_kept(tmp_path):
     assert [m for m in whole if m in kept] == kept and kept[-1] == whole[-1]
     assert any('cannot be read' in damage.text for damage in found.said)
     assert not found.verdict.sound
+
+
+def test_a_row_with_a_time_before_1970_is_named_and_the_others_are_kept(tmp_path, capsys):
+    bag = WRITERS['rosbags-sqlite-9'](tmp_path / 'bag', RUN)
+    with sqlite3.connect(bag / 'bag.db3') as database:
+        database.execute('UPDATE messages SET timestamp = -5 WHERE id = 7')
+    database.close()
+    assert main(['bag', 'recover', str(bag), '--out', str(tmp_path / 'new')]) == 1
+    assert 'bag.db3 row 7: its time is -5 ns' in capsys.readouterr().out
+    whole = messages(WRITERS['rosbags-sqlite-9'](tmp_path / 'whole', RUN))
+    assert messages(tmp_path / 'new') == whole[:6] + whole[7:]
+
+
+def test_a_damaged_first_chunk_whose_definitions_the_summary_does_not_repeat_is_said(tmp_path):
+    write = by_mcap(CompressionType.NONE, repeat_schemas=False)
+    bag = write(tmp_path / 'bag', RUN)
+    flip(bag / 'a.mcap', 300)
+    found = verify(bag).findings
+    assert 'CRC' in found.named[0].text and found.counts['file'] > 1
+
+
+@pytest.mark.parametrize('qos', ['- 2024-99-99', '- ' + '9' * 5000, '[' * 3000])
+def test_qos_that_is_no_yaml_does_not_cost_the_bag(tmp_path, qos):
+    record = RUN[0]
+    kind = type_name(type(record))
+    with (tmp_path / 'a.mcap').open('wb') as file:
+        writer = Writer(file)
+        writer.start('ros2', 'somebody')
+        schema = writer.register_schema(kind, 'ros2msg', schema_text(kind))
+        said = {'offered_qos_profiles': qos}
+        channel = writer.register_channel('/run/run', 'cdr', schema, said)
+        writer.add_message(channel, 1000, encode(record), 500)
+        writer.finish()
+    assert recover(tmp_path / 'a.mcap', tmp_path / 'new').verdict.sound
 
 
 def test_nothing_is_written_where_nothing_can_be_read_or_something_is(tmp_path):

@@ -7,9 +7,14 @@ from offline.bag_making import message, write, write_messages
 from test_saved_models import trained
 
 from codetr_ros import checkpoints, cli
+from codetr_ros.bags.definitions import encode
 from codetr_ros.bags.reader import Bag
+from codetr_ros.bags.topics import BagTopic
 from codetr_ros.bags.verify import verify
+from codetr_ros.bags.writer import McapWriter
+from codetr_ros.received import type_name
 from codetr_ros.records import (
+    TOPICS,
     CompositeReward,
     RunSpec,
     StepRewards,
@@ -162,3 +167,29 @@ def test_a_bag_without_scores_has_nothing_to_label(fitted, a_run, tmp_path, caps
     bag = write(tmp_path / 'bag', [r for r in a_run.records if isinstance(r, keep)])
     label(bag, fitted, tmp_path / 'new', code=2)
     assert 'but no CompositeReward' in capsys.readouterr().err
+
+
+def test_labels_number_on_where_the_recorders_own_have_a_gap(a_run, fitted, tmp_path):
+    topics = [
+        BagTopic(f'/run/{name}', type_name(kind), 10, False) for kind, name in TOPICS.items()
+    ]
+    writer = McapWriter(tmp_path / 'old', topics)
+    for i, record in enumerate(a_run.records):
+        name = f'/run/{TOPICS[type(record)]}'
+        writer.counts[name] += isinstance(record, StepRewards) and record.phase == 3
+        writer.write(name, encode(record), 1000 + i)
+    writer.close()
+    before = verify(tmp_path / 'old').findings.counts
+    assert before['gap'], 'numbers of step_rewards are missing'
+    new = label(tmp_path / 'old', fitted, tmp_path / 'new')
+    assert verify(new).findings.counts == before
+
+
+def test_times_that_a_message_cannot_say_are_refused_by_name(a_run, fitted, tmp_path, capsys):
+    old = write_messages(
+        tmp_path / 'old',
+        ((f'/run/{TOPICS[type(r)]}', lambda store, r=r: message(store, r), 2**62)
+         for r in a_run.records),
+    )  # fmt: skip
+    label(old, fitted, tmp_path / 'new', code=2)
+    assert 'StepRewards cannot be written' in capsys.readouterr().err

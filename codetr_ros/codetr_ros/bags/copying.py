@@ -43,7 +43,7 @@ class _Topic:
     def qos(self) -> list[dict[str, Any]]:
         try:
             said = load_yaml(self.channel.qos)
-        except yaml.YAMLError:
+        except (yaml.YAMLError, ValueError, RecursionError):  # of dates and numbers, too
             return []
         return said if isinstance(said, list) else []
 
@@ -136,6 +136,7 @@ def copy(messages: Iterable[RawMessage], folder: Path, library: str) -> Copied:
             if file is None or message.place.file != source:
                 if file is not None:
                     file.finish()
+                    file.close()
                 source = message.place.file
                 name = f'{folder.name}_{len(made.files)}.mcap'
                 file = _File(folder / name, LIBRARY if message.channel.numbered else library)

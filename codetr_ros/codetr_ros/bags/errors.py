@@ -18,7 +18,7 @@ class Place(NamedTuple):
     inside: int | None = None  # byte within the chunk's uncompressed records
 
     def __str__(self) -> str:
-        if self.file.suffix == '.db3':
+        if '.db3' in self.file.suffixes[-2:]:  # also where the file is compressed
             return f'{self.file} row {self.offset}'
         inside = '' if self.inside is None else f', byte {self.inside} of that chunk'
         return f'{self.file} byte {self.offset}{inside}'

@@ -150,8 +150,13 @@ def survey(path: Path | str) -> dict[str, Any]:
     Raises:
         BagError: there is no bag there, or its messages are not those that we read.
     """
-    faults: list[Damage] = []
-    bag = Bag(path, faults.append)
+    faults = 0
+
+    def damaged(_: Damage) -> None:
+        nonlocal faults
+        faults += 1
+
+    bag = Bag(path, damaged)
     runs: dict[tuple[str, str], Run] = {}
     times = Range()
     for entry in bag.entries():
@@ -169,5 +174,5 @@ def survey(path: Path | str) -> dict[str, Any]:
             for name, topic in bag.topics.items()
         },
         'runs': [run.report() for _, run in sorted(runs.items())],
-        'faults': len(faults),
+        'faults': faults,
     }

@@ -10,6 +10,7 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -176,8 +177,9 @@ class McapFile:
             if isinstance(record, mcap_records.Schema):
                 self._schemas.setdefault(record.id, record)
             elif isinstance(record, mcap_records.Channel) and record.id not in self._said:
-                self._said[record.id] = record
-                self._channels[record.id] = self._channel(record)
+                with suppress(FaultError):  # a writer need not repeat the definitions there
+                    self._channels[record.id] = self._channel(record)
+                    self._said[record.id] = record
 
     def _next(self, file: BinaryIO, at: int, size: int, ended: bool) -> tuple[int, bytes]:
         head = file.read(HEAD.size)

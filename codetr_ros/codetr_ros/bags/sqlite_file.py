@@ -110,6 +110,9 @@ class SqliteFile:
             if channel is None or not isinstance(data, bytes) or type(time) is not int:
                 self._say(row, f'this is no message of a topic it knows: {topic!r}', length)
                 continue
+            if time < 0:
+                self._say(row, f'its time is {time} ns, before there was time', length)
+                continue
             self.counts[channel.topic] += 1
             self.unchecked += 1
             yield RawMessage(channel, time, time, 0, data, Place(self.shown, row))

@@ -132,7 +132,8 @@ class McapWriter:
             topic: its full name; one of the bag's topics.
             data: CDR bytes, with their header.
             log_time: when it was received [ns].
-            publish_time: when it was published [ns]; as received where not known.
+            publish_time: when it was published [ns]; as received where not known, or where a
+                node says that it was before 1970, which the file cannot hold.
 
         Raises:
             BagError: it cannot be written. The bag is then closed, and holds what had been
@@ -140,12 +141,14 @@ class McapWriter:
         """
         if self.closed:
             raise BagError(f'bag {self.folder} is closed: nothing can be written to it any more')
+        if publish_time is None or publish_time <= 0:
+            publish_time = log_time
         try:
             if 0 < self._split_bytes <= self._stream.tell():
                 self._finish_file()
                 self._open_file()
             self._writer.add_message(
-                self._channels[topic], log_time, data, publish_time or log_time, self.counts[topic]
+                self._channels[topic], log_time, data, publish_time, self.counts[topic]
             )
         except OSError as error:
             raise self._broken(error) from error

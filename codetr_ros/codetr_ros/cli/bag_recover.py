@@ -71,8 +71,8 @@ def show(report: Mapping[str, Any], console: Console) -> None:
     verdict = report['verdict']
     for finding in verdict['findings'][:SHOWN]:
         say(f'in the new bag: {finding["kind"]}: {finding["text"]}')
-    if len(verdict['findings']) > SHOWN:
-        say(f'`codetr bag verify {report["new"]}` names {len(verdict["findings"]) - SHOWN} more')
+    if (more := sum(verdict['found'].values()) - SHOWN) > 0:
+        say(f'{more} more in the new bag: `codetr bag verify {report["new"]}`')
     for remark in verdict['remarks']:
         say(f'note: {remark}')
     for run in verdict['runs']:

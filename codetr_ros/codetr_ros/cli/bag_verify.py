@@ -63,8 +63,8 @@ def show(report: Mapping[str, Any], limit: int, console: Console) -> None:
             text = f'{finding["kind"]}: {finding["place"]}: {finding["text"]}'
             console.print(escape(text), highlight=False)
     for kind, count in report['found'].items():
-        if count > limit:
-            console.print(f'{kind}: {count - limit} more', highlight=False)
+        if (more := count - min(shown[kind], limit)) > 0:  # of very many not all are named
+            console.print(f'{kind}: {more} more', highlight=False)
     for remark in report['remarks']:
         console.print(f'note: {escape(remark)}', highlight=False)
     for run in report['runs']:

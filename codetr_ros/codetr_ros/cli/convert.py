@@ -12,6 +12,7 @@ from codetr_ros.bags.errors import BagError
 from codetr_ros.cli import refuse
 from codetr_ros.config import SettingsError
 from codetr_ros.offline.errors import FitError
+from codetr_ros.records import RecordError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +40,7 @@ def main(arguments: Sequence[str]) -> int:
     try:
         rules = mapping.load(Path(given.mapping))
         made = convert(Bag(Path(given.bag)), rules, Path(given.out))
-    except (BagError, FitError, SettingsError) as error:
+    except (BagError, FitError, RecordError, SettingsError) as error:
         return refuse(str(error))
     read = ', '.join(f'{n} of {topic}' for topic, n in sorted(made.messages.items()))
     lost = ', '.join(f'{n} {what}' for what, n in made.dropped.items())

@@ -257,7 +257,7 @@ def _phases(arguments: Sequence[str], given: Arguments) -> int:
     found = stretches(index, own.delay, given.fit.stretch_steps)
     judged = None
     if folded.core.method is not None and folded.core.method.target_scale:
-        newest = list(loading.newest(found.found, own.memory_steps))
+        newest = list(loading.newest(found.found, given.settings.memory_steps))
         sizes = index.observation_size, index.action_size
         loaded = loading.load(index.bags, newest, sizes, own.delay, true_rewards=True)
         unit = judging.unit(folded.core.method, given.settings)

@@ -13,6 +13,7 @@ from codetr_ros.bags.errors import BagError
 from codetr_ros.cli import FAILED, refuse
 from codetr_ros.config import SettingsError
 from codetr_ros.offline.errors import FitError
+from codetr_ros.records import RecordError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +52,7 @@ def main(arguments: Sequence[str]) -> int:
         (bag,) = sources.open_bags([Path(given.bag)])
         model = saved.read(Path(given.checkpoint))
         made = labelling.label(bag, model, Path(given.out), given.memory_steps)
-    except (BagError, CheckpointError, FitError, SettingsError) as error:
+    except (BagError, CheckpointError, FitError, RecordError, SettingsError) as error:
         return refuse(str(error))
     except RewardModelError as error:
         print(f'codetr: {error}', file=sys.stderr)

@@ -91,11 +91,13 @@ def _messages(
     last: RawMessage | None = None
     for message in bag.raw():
         channels[message.channel.topic] = message.channel
-        counts[message.channel.topic] += 1
+        made.messages += 1
+        if message.channel.numbered:  # labels number on behind the last, gaps or not
+            topic = message.channel.topic
+            counts[topic] = max(counts[topic], message.sequence + 1)
         last = message
         yield message
     assert last is not None  # the index found steps
-    made.messages = counts.total()
     for key, parts in _parts(found).items():
         topic = f'{index.topics[key].rpartition("/")[0]}/{TOPICS[StepRewards]}'
         channel = channels.setdefault(topic, _channel(topic))
