@@ -45,6 +45,16 @@ def test_the_cache_lies_where_torch_or_the_desktop_standard_say(monkeypatch):
     assert compilation.cache_folder() == Path.home() / '.cache/codetr_ros/torch'
 
 
+def test_a_cache_that_cannot_be_written_to_is_named_with_the_way_out(tmp_path, monkeypatch):
+    (tmp_path / 'file').touch()
+    monkeypatch.setattr(compilation, 'missing', lambda: '')
+    monkeypatch.setenv('TORCHINDUCTOR_CACHE_DIR', str(tmp_path / 'file' / 'cache'))
+    with pytest.raises(CompilationError) as error:
+        FlatSAC(3, 1, SacSettings(hidden=(8,), compile=True), 0)
+    for part in (f'{tmp_path}/file/cache', 'TORCHINDUCTOR_CACHE_DIR to a', 'sac.compile=false'):
+        assert part in str(error.value)
+
+
 BROKEN = """#!/bin/sh
 [ "$1" = --version ] && { echo "g++ (Broken) 13.3.0"; exit 0; }
 echo no room for objects >&2

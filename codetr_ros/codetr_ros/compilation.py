@@ -8,6 +8,7 @@ import os
 import shutil
 import sys
 import sysconfig
+import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -55,11 +56,13 @@ def compiled(function: _Function, example: Sequence[Any], without: str) -> _Func
         without: the setting that makes do without compiling, and its value: for the error.
 
     Raises:
-        CompilationError: a compiler or a header is missing, or the compiler failed.
+        CompilationError: a compiler or a header is missing, the compiler failed, or there is no
+            place to keep what was compiled.
     """
     lacking = missing()
     if lacking:
         raise CompilationError(f'{lacking}: {REMEDY}, or set {without}')
+    _make_cache(without)
     os.environ.setdefault(_CACHE, str(cache_folder()))
     import torch
     from torch._dynamo.exc import TorchDynamoException
@@ -82,3 +85,16 @@ def compiled(function: _Function, example: Sequence[Any], without: str) -> _Func
             f'It said: {said[-2000:]}'
         ) from error
     return result
+
+
+def _make_cache(without: str) -> None:
+    """Make the folder for what is compiled, and see whether it can be written to."""
+    folder = cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise CompilationError(
+            f'what is compiled cannot be kept in {folder} ({error.strerror}): set the environment '
+            f'variable {_CACHE} to a folder that can be written to, or set {without}'
+        ) from None
