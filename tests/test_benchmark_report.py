@@ -266,10 +266,14 @@ def test_several_benchmarks_are_reported_together_unless_they_contradict_each_ot
     changed = {'evaluate_every': 1000, 'evaluate_episodes': 2, 'sac': {'batch': 9}}
     three = benchmark(tmp_path / 'three', lambda cell: 0.2, methods=['true'], config=changed)
 
+    longer = benchmark(tmp_path / 'longer', lambda cell: 0.9, delays=[50], steps=6000)
+
     found = results.read([one.path, two.path])
     assert table.methods(found) == ['none', 'uniform']
     with pytest.raises(BenchmarkError, match='has sac = .*what is compared must be alike'):
         results.read([one.path, three.path])
+    with pytest.raises(BenchmarkError, match='has steps = 6000, but'):  # a mean over delays
+        results.read([one.path, longer.path])
     with pytest.raises(BenchmarkError, match='cell .*_none_seed0 is in .*one and in .*one'):
         results.read([one.path, one.path])
 

@@ -102,13 +102,15 @@ def _read(folder: Folder) -> Iterator[Result]:
 
 
 def _check(results: Sequence[Result]) -> None:
-    """Cells that differ in method and seed only must be alike in everything else."""
-    first: dict[tuple[str, str, int], Result] = {}
+    """Cells of a task must be alike in all but composite reward, delay, method and seed: what they
+    came to is averaged and compared.
+    """
+    first: dict[str, Result] = {}
     for result in results:
-        other = first.setdefault((result.task, result.composite, result.delay), result)
+        other = first.setdefault(result.task, result)
         for name in {**result.settings, **other.settings}:
             here, there = result.settings.get(name), other.settings.get(name)
-            if name not in ('method', 'seed') and here != there:
+            if name not in ('composite', 'delay', 'method', 'seed') and here != there:
                 raise BenchmarkError(
                     f'{result.folder}: cell {result.cell} has {name} = {here!r}, but '
                     f'{other.cell} in {other.folder} has {there!r}: what is compared must be '
