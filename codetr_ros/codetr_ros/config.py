@@ -54,7 +54,7 @@ class Group(BaseModel):
 
 
 class CodetrSettings(Group):
-    """The reward transformer (sections 1.4 to 1.7 of the method; the supplement's Table 1)."""
+    """The reward transformer (the supplement's Table 1)."""
 
     layers: int = Field(3, ge=1, le=24, description='causal transformer layers')
     heads: int = Field(4, ge=1, le=64, description='attention heads of each causal layer')
@@ -183,7 +183,7 @@ class MlpSettings(PerceptronSettings):
 
 
 class RrdSettings(PerceptronSettings):
-    """Randomized return decomposition (section 4 of the method)."""
+    """Randomized return decomposition (Ren et al., arXiv 2111.13485)."""
 
     loss: Literal['biased', 'unbiased'] = Field(
         'biased',
@@ -207,7 +207,7 @@ class RrdSettings(PerceptronSettings):
 
 
 class SacSettings(Group):
-    """Soft actor-critic as jaxrl has it (section 8 of the method)."""
+    """Soft actor-critic as jaxrl has it."""
 
     hidden: Hidden = Field(
         (256, 256), min_length=1, max_length=8, description='hidden layer widths'
@@ -247,7 +247,7 @@ class SacSettings(Group):
 
 
 class HcSettings(Group):
-    """The critic of method `hc` (section 7 of the method); the rest of it is `sac`'s."""
+    """The critic of method `hc` (Han et al., arXiv 2106.11854); the rest of it is `sac`'s."""
 
     history: Literal['singleton', 'recurrent'] = Field(
         'recurrent',
@@ -270,7 +270,7 @@ class HcSettings(Group):
 
 
 class LirpgSettings(Group):
-    """PPO with a learnt intrinsic reward (section 6 of the method); the published constants."""
+    """PPO with a learnt intrinsic reward (Zheng et al., arXiv 1804.06459); its constants."""
 
     hidden: Hidden = Field(
         (64, 64), min_length=1, max_length=8, description='hidden layer widths of all networks'
@@ -477,7 +477,7 @@ class Settings(Group):
 
     def flat(self) -> dict[str, Any]:
         """Every setting by its dotted name, as ROS parameters and errors call it."""
-        return dict(_flatten(self.model_dump()))
+        return dict(flatten(self.model_dump()))
 
     def changed(self, changes: Mapping[str, Any], source: str = 'change') -> 'Settings':
         """A copy with some settings changed, given by dotted name.
@@ -501,10 +501,11 @@ class Settings(Group):
         return parse(data, source)
 
 
-def _flatten(data: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
+def flatten(data: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
+    """Values of nested mappings, each with its dotted name."""
     for key, value in data.items():
         if isinstance(value, Mapping):
-            yield from _flatten(value, f'{prefix}{key}.')
+            yield from flatten(value, f'{prefix}{key}.')
         else:
             yield f'{prefix}{key}', value
 

@@ -30,6 +30,7 @@ import yaml
 
 from codetr_ros import run_folder
 from codetr_ros.benchmark.spec import BenchmarkError, Cell, Spec
+from codetr_ros.config import flatten
 from codetr_ros.run_folder import atomic_write
 from codetr_ros.summary import versions
 
@@ -189,8 +190,8 @@ class Folder:
             there = yaml.safe_load(path.read_text())
         except (OSError, yaml.YAMLError) as error:
             return f'{path} cannot be read: {error}'
-        before = dict(_flat(there if isinstance(there, dict) else {}))
-        now = dict(_flat(cell.settings.model_dump(mode='json')))
+        before = dict(flatten(there if isinstance(there, dict) else {}))
+        now = dict(flatten(cell.settings.model_dump(mode='json')))
         names = [name for name in {**before, **now} if before.get(name) != now.get(name)]
         shown = [f'{n}: {before.get(n)!r} there, {now.get(n)!r} here' for n in names[:4]]
         return '; '.join(shown) + ('; ...' if len(names) > 4 else '')
@@ -243,14 +244,6 @@ def _row(cell: Cell) -> dict[str, Any]:
     names = ('task', 'composite', 'delay', 'method', 'seed', 'steps')
     settings = cell.settings.model_dump(mode='json', include=set(names))
     return {name: settings[name] for name in names} | {'settings_hash': cell.settings.hash()}
-
-
-def _flat(data: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
-    for name, value in data.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f'{prefix}{name}.')
-        else:
-            yield f'{prefix}{name}', value
 
 
 def session(spec: Path, workers: int, ray: str | None) -> dict[str, Any]:

@@ -89,21 +89,10 @@ def settings_differences(settings: Mapping[str, Any]) -> list[tuple[str, Any, An
 
     What a benchmark varies (task, composite, delay, method, seed) is left out.
     """
-    there = config.load('paper').model_dump(mode='json')
+    there = dict(config.flatten(config.load('paper').model_dump(mode='json')))
     varied = ('task', 'composite', 'delay', 'method', 'seed')
-    found = []
-    for name, value in _flat(settings):
-        expected = dict(_flat(there)).get(name)
-        if name not in varied and value != expected:
-            found.append((name, expected, value))
-    return found
-
-
-def _flat(data: Mapping[str, Any], prefix: str = '') -> list[tuple[str, Any]]:
-    found: list[tuple[str, Any]] = []
-    for name, value in data.items():
-        if isinstance(value, Mapping):
-            found += _flat(value, f'{prefix}{name}.')
-        else:
-            found.append((prefix + name, value))
-    return found
+    return [
+        (name, there.get(name), value)
+        for name, value in config.flatten(settings)
+        if name not in varied and value != there.get(name)
+    ]

@@ -165,7 +165,7 @@ def _base(keys: _Keys, path: Path) -> Settings:
                 f'file ({beside})'
             )
         name = str(beside)
-    changes = dict(_flatten(given))
+    changes = dict(config.flatten(given))
     if decided := [setting for setting in changes if setting in _AXES]:
         raise BenchmarkError(
             f'{source}.{decided[0]} = {changes[decided[0]]!r}: the key {_AXES[decided[0]]} of '
@@ -178,14 +178,6 @@ def _base(keys: _Keys, path: Path) -> Settings:
             'between evaluations'
         )
     return settings
-
-
-def _flatten(given: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
-    for name, value in given.items():
-        if isinstance(value, Mapping):
-            yield from _flatten(value, f'{prefix}{name}.')
-        else:
-            yield f'{prefix}{name}', value
 
 
 def _cells(keys: _Keys, base: Settings, path: Path) -> Iterator[Cell]:
