@@ -1,8 +1,10 @@
 import math
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
@@ -22,6 +24,12 @@ def test_the_paper_preset_is_the_default_of_every_setting() -> None:
     assert {
         name: (paper[name], default[name]) for name in paper if paper[name] != default[name]
     } == {}
+
+
+def test_the_paper_preset_spells_out_every_setting_of_every_method() -> None:
+    text = resources.files('codetr_ros.presets').joinpath('paper.yaml').read_text()
+    said = dict(config.flatten(yaml.safe_load(text)))
+    assert [name for name in Settings().flat() if '.' in name and name not in said] == []  # type: ignore[call-arg]
 
 
 def test_the_papers_table_is_what_the_paper_preset_says() -> None:
