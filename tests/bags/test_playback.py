@@ -7,16 +7,20 @@ import pytest
 from bags.making import SETTINGS, WRITERS, a_run, ours
 from builders import run, same
 
-from codetr_ros.bags.playback import Item, Pace, Playback, PlayError, causal, items, survey
+from codetr_ros.bags import causal as causal_module
+from codetr_ros.bags.causal import causal
+from codetr_ros.bags.playback import Item, Pace, Playback, PlayError, items, survey
 from codetr_ros.bags.reader import Bag
 from codetr_ros.records import (
     Commit,
     CompositeReward,
+    Metrics,
     Policy,
     Presence,
     RunSpec,
     StepRewards,
     Transitions,
+    TrueRewards,
     metrics,
 )
 
@@ -166,6 +170,51 @@ def test_steps_recorded_before_the_commit_that_permitted_them_come_after_it():
         elif isinstance(r, Transitions):
             assert r.phase - 1 <= seen
     assert list(causal(played(records), 1)) == played(records)  # nothing else is moved
+
+
+def topic_by_topic(records, ahead):
+    """Each topic in its own order, some so many messages ahead of the others."""
+    places = sorted(
+        (i - ahead.get(type(r), 0), i) for i, r in enumerate(records) if not isinstance(r, RunSpec)
+    )
+    return [records[i] for _, i in places]
+
+
+@pytest.mark.parametrize('first', [Transitions, CompositeReward, Commit, TrueRewards])
+@pytest.mark.parametrize('lag', [1, 2])
+def test_a_run_is_played_in_whatever_order_its_topics_were_recorded(first, lag):
+    records = a_run(phases=6)
+    late = topic_by_topic(records, {first: 20, Metrics: 30})
+    assert late != [r for r in records if not isinstance(r, RunSpec)]
+    p = playback(late, phases=6, lag=lag)
+    for phase in range(6):
+        p.receive(handled(phase))
+    found = until_it_waits(p.work())
+    assert p.finished and phases_of(found) == [0, 1, 2, 3, 4, 5]
+    assert sorted(map(id, found)) == sorted(map(id, late))
+
+
+def test_a_commit_that_is_missing_is_an_error_and_nothing_waits_for_it():
+    records = [r for r in a_run() if not (isinstance(r, Commit) and r.phase == 1)]
+    p = playback(records)
+    for phase in range(3):
+        p.receive(handled(phase))
+    with pytest.raises(PlayError, match="transitions 8 to 11 of 'sim' are not in the bag"):
+        until_it_waits(p.work())
+
+
+def test_where_a_topic_is_missing_no_more_is_held_than_a_queue_has(monkeypatch):
+    monkeypatch.setattr(causal_module, '_MOST_HELD', 30)
+    taken = []
+    records = [r for r in a_run(phases=30) if not isinstance(r, CompositeReward)]
+    found = causal((taken.append(i) or i for i in played(records)), 1)
+    out = list(zip(found, iter(lambda: len(taken), None), strict=False))
+    assert len(out) == len(records) - 1
+    said = [item.record for item, _ in out if isinstance(item.record, (Transitions, Commit))]
+    assert said == [r for r in records if isinstance(r, (Transitions, Commit))]
+    assert max(read - given for given, (_, read) in enumerate(out)) <= 31
+    with pytest.raises(PlayError, match="composite_rewards 0 to 3 of 'sim' are not in the bag"):
+        until_it_waits(playback(records).work())
 
 
 class Clock:

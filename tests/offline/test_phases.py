@@ -8,7 +8,7 @@ import pytest
 from offline.bag_making import write
 
 from codetr_ros import checkpoints, cli
-from codetr_ros.records import Commit, RunSpec, StepRewards, Transitions
+from codetr_ros.records import Commit, CompositeReward, RunSpec, StepRewards, Transitions
 
 DIGEST = 'reward_model_sha256'
 
@@ -27,6 +27,23 @@ def test_folding_the_bag_ends_with_the_weights_and_labels_of_the_run(a_run, tmp_
     assert said['recorded_labels'] == {'same': made, 'other': 0}
     assert said['phases'] == a_run.settings.phases
     assert said['changed_settings'] == {}
+
+
+def test_topics_may_have_been_recorded_in_another_order(a_run, tmp_path):
+    """As by a recorder that hears the commits before the last scores, and some steps later."""
+    records = list(a_run.records)
+    order = sorted(
+        range(len(records)),
+        key=lambda i: i + {CompositeReward: 30, Transitions: 5}.get(type(records[i]), 0),
+    )
+    bag = write(tmp_path / 'bag', [records[i] for i in order])
+
+    said = fit(bag, tmp_path / 'out')
+
+    assert said[DIGEST] == a_run.reports['reward'][DIGEST]
+    made = sum(len(r.lengths) for r in records if isinstance(r, StepRewards))
+    assert said['recorded_labels'] == {'same': made, 'other': 0}
+    assert said['skipped'] == {}
 
 
 def test_the_last_checkpoint_holds_these_very_weights(a_run, tmp_path):

@@ -7,11 +7,12 @@ same order. No ROS needed.
 """
 
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from codetr_ros.bags.causal import causal, named, publisher
 from codetr_ros.bags.reader import Bag
 from codetr_ros.config import Settings, SettingsError, from_canonical
 from codetr_ros.records import (
@@ -129,31 +130,6 @@ def items(bag: Bag, run_id: str) -> Iterator[Item]:
             continue
         if entry.record.run_id == run_id:
             yield Item(entry.record, bytes(raw.data), entry.log_time)
-
-
-def causal(found: Iterable[Item], lag: int) -> Iterator[Item]:
-    """The same messages, where steps never come before the commit that they were permitted after.
-
-    A recorder that hears commits as everybody else does (`ros2 bag record`) may have noted them
-    the other way round.
-    """
-    held: deque[Item] = deque()
-    committed = -1
-
-    def early(item: Item) -> bool:
-        return isinstance(item.record, Transitions) and item.record.phase - lag > committed
-
-    for item in found:
-        if isinstance(item.record, Commit):
-            committed = item.record.phase
-            yield item
-            while held and not early(held[0]):
-                yield held.popleft()
-        elif held or early(item):
-            held.append(item)
-        else:
-            yield item
-    yield from held
 
 
 class Pace:
@@ -274,8 +250,7 @@ class Playback:
             return False
         if not isinstance(record, (Transitions, CompositeReward)):
             return True
-        name = record.source if isinstance(record, Transitions) else record.scorer
-        key = (type(record), name)
+        key = publisher(record)
         if record.sequence < self._due[key]:
             self.counters[f'{topic} recorded twice'] += 1
             return False
@@ -296,7 +271,7 @@ class Playback:
 
     def _check(self, commit: Commit) -> None:
         """Refuse a commit of which something has not been played."""
-        for key, number in _named(commit).items():
+        for key, number in named(commit).items():
             if number >= self._due[key]:
                 self._lacks(key, number)
 
@@ -320,15 +295,3 @@ class Playback:
     def report(self) -> dict[str, Any]:
         """Counts for people."""
         return {'counters': dict(self.counters), 'phases': self.phase + 1}
-
-
-def _named(commit: Commit) -> dict[tuple[type, str], int]:
-    """The last sequence number of each publisher that a commit names."""
-    return {
-        (kind, name): number
-        for kind, names, last in (
-            (Transitions, commit.sources, commit.transitions),
-            (CompositeReward, commit.scorers, commit.scores),
-        )
-        for name, number in zip(names, last.tolist(), strict=True)
-    }

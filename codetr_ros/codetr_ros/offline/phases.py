@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from codetr_ros.bags.causal import causal
 from codetr_ros.bags.reader import Bag
 from codetr_ros.config import Settings
 from codetr_ros.offline.errors import FitError
@@ -115,10 +116,9 @@ def fold(
     found = Fold(core, run, settings, 0, [], core.refused, Recorded())
     kinds = (*core.subscribes, StepRewards)
     work = core.work()
-    for entry in bag.entries(kinds):
+    ours = (entry for entry in bag.entries(kinds) if entry.record.run_id == run.run_id)
+    for entry in causal(ours, settings.lag):
         record = entry.record
-        if record.run_id != run.run_id:
-            continue
         if isinstance(record, StepRewards):
             found.recorded.recorded(record)
             continue
