@@ -88,10 +88,6 @@ class Attempt:
         """Since its start."""
         return time.monotonic() - self._began
 
-    def phases(self) -> int:
-        """Phases learnt from so far, as its checkpoints say; 0 in the warm-up."""
-        return phases_in(self._place)
-
     def finish(self) -> dict[str, Any]:
         """Put what an ended process has made into the cell's place.
 

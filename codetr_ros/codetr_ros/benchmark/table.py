@@ -70,11 +70,6 @@ class Row:
     delays: tuple[int, ...]
     entries: tuple[Entry, ...]
 
-    @property
-    def best(self) -> Entry | None:
-        """The entry with the highest mean."""
-        return next((entry for entry in self.entries if entry.best), None)
-
 
 def methods(results: Sequence[Result]) -> list[str]:
     """Every method, in the order of the specs."""
