@@ -1,5 +1,6 @@
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -261,6 +262,12 @@ def test_evaluate_refuses_what_it_cannot_evaluate(
     assert cli.main(['evaluate', str(tmp_path)]) == 2
     assert 'is not the folder of a run' in capsys.readouterr().err
 
+    other = tmp_path / 'other'
+    shutil.copytree(run_dir, other)
+    settings = run_folder.read_settings(other).changed({'sac.hidden': (9,)})
+    run_folder.write_settings(other, settings)
+    assert cli.main(['evaluate', str(other)]) == 2
+    assert 'it was saved with other settings of sac' in capsys.readouterr().err
     assert cli.main(['evaluate', str(run_dir), '--episodes', '0']) == 2
     assert 'evaluate_episodes = 0' in capsys.readouterr().err
 

@@ -52,12 +52,13 @@ def main(arguments: Sequence[str]) -> int:
         return refuse(str(error))
 
     from codetr_ros.checkpoints import CheckpointError
+    from codetr_ros.learners.learner import LearnerError
     from codetr_ros.tasks import TaskError
 
     try:
         policy = newest_policy(folder, settings)
         results = evaluate(policy, settings)
-    except (RunFolderError, CheckpointError, TaskError) as error:
+    except (RunFolderError, CheckpointError, LearnerError, TaskError) as error:
         return refuse(str(error))
     console = Console()
     console.print(
@@ -75,6 +76,7 @@ def newest_policy(folder: Path, settings: Settings) -> Policy:
     Raises:
         RunFolderError: there is no checkpoint, or none with a policy that has learnt.
         CheckpointError: the checkpoint is damaged.
+        LearnerError: it is of other settings than the run's folder has.
     """
     from codetr_ros import checkpoints
     from codetr_ros.learners import methods, network

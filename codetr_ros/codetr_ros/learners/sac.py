@@ -21,11 +21,12 @@ from torch.optim.adam import adam
 
 from codetr_ros import seeding
 from codetr_ros.config import SacSettings
+from codetr_ros.learners.learner import LearnerError
 from codetr_ros.learners.network import Actor
 from codetr_ros.trajectories import StepBatch
 
 
-class SacError(ValueError):
+class SacError(LearnerError):
     """A state that does not fit this learner: the message names what came and what was due."""
 
 
