@@ -73,7 +73,8 @@ DIFFERENCES = (
     'The reward model learns per phase (1000 steps) here, per new trajectory there; early in '
     'training, when episodes are short, that differs.',
     'Composite rewards are divided by one positive constant of the warm-up (target_scale) before '
-    'anything learns from them; the paper does not mention it.',
+    'anything learns from them; the paper does not mention it. Not so with ircr, which brings '
+    'them to between 0 and 1, and lirpg, which divides by a running deviation.',
     'What step reward CoDeTr stores (the weighted one here), the scale of its attention logits, '
     'its context and its initial weights are not stated there: see the settings and '
     'config/presets.',
