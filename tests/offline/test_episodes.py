@@ -132,6 +132,14 @@ def test_the_same_run_in_two_bags_is_learnt_from_once(tmp_path):
     assert found.scores == 1
 
 
+def test_a_copy_is_known_though_its_scores_come_before_its_steps(tmp_path):
+    (a,) = steps(14, [0])
+    found = index(tmp_path, [a, *scores((0, 7))], [*scores((0, 7)), a, *scores((7, 7))])
+
+    assert (found.steps, found.scores, found.skipped[episodes.COPIES]) == (14, 1, 14)
+    assert len(stretches(found, 7, 100).found) == 1
+
+
 def test_other_steps_under_the_same_names_in_another_bag_are_learnt_from(tmp_path):
     (a,) = steps(7, [0])
     b = replace(a, observations=a.observations + 1)
@@ -174,3 +182,7 @@ def test_the_delay_is_that_of_the_run_or_else_the_longest_segment(tmp_path):
     assert unknown.notes == [
         'delay = 5, the longest scored segment: no run in the bags says what it was'
     ]
+
+    longer = index(tmp_path / 'c', [run(), *steps(9, [0]), *scores((0, 9))])
+    assert longer.facts()['delay'] == 9
+    assert longer.notes == ['delay = 9, the longest scored segment: a run in the bags has 7']

@@ -208,7 +208,8 @@ class Index:
 
     def _copied(self, place: tuple[Key, int], chunk: Transitions) -> bool:
         """Whether an episode that begins here is in an earlier bag already, byte for byte."""
-        if len(self.bags) == 1 or place in self.episodes:
+        known = self.episodes.get(place)
+        if len(self.bags) == 1 or (known is not None and known.pieces):
             return False
         print_of = blake2b(chunk.observations.tobytes(), digest_size=8)
         print_of.update(chunk.actions.tobytes())
@@ -217,6 +218,9 @@ class Index:
         if self._prints.setdefault(seen, key.bag) == key.bag:
             return False
         self._copies.add(place)
+        if known is not None:  # scores that came before their steps
+            self.scores -= len(known.firsts)
+            del self.episodes[place]
         return True
 
     def _score(self, key: Key, reward: CompositeReward) -> None:
@@ -252,9 +256,12 @@ class Index:
         known = max((settings.delay for settings in self.settings), default=0)
         delay = max(known, self.longest)
         if delay != known:
-            self.notes.append(
-                f'delay = {delay}, the longest scored segment: no run in the bags says what it was'
+            run = (
+                f'a run in the bags has {known}'
+                if known
+                else 'no run in the bags says what it was'
             )
+            self.notes.append(f'delay = {delay}, the longest scored segment: {run}')
         tasks = [*self.tasks, *(settings.task for settings in self.settings), 'unknown']
         return {'delay': delay, 'task': tasks[0]}
 

@@ -193,13 +193,12 @@ def _fit(
         steps = learnt.memory.steps + found.held_out.memory.steps
         found.most_steps = max(found.most_steps, steps)
         method.prepare(learnt.memory)
-        if not isinstance(method, Learned):
-            continue
-        for check in _learn(method, learnt, found, settings, how, made.passes == 1):
-            found.curve.append(check)
-            if found.best is None or check.held_out_loss < found.best.held_out_loss:
-                found.best, found.kept = check, method.state()
-            say(check)
+        if isinstance(method, Learned):
+            for check in _learn(method, learnt, found, settings, how, made.passes == 1):
+                found.curve.append(check)
+                if found.best is None or check.held_out_loss < found.best.held_out_loss:
+                    found.best, found.kept = check, method.state()
+                say(check)
         del learnt  # before the next part takes its memory
         if found.stopped:
             break
