@@ -25,6 +25,8 @@ def bag(tmp_path):
             '--to nobody needs --pace recorded or --rate: nobody says when to go',
         ),
         (['--to', 'nobody', 'reward'], '--to nobody reward: either nobody, or nodes'),
+        (['--namespace', 'play'], "--namespace 'play' must be as ROS has them: /name"),
+        (['--namespace', '/1st'], "--namespace '/1st' must be"),
         (['--to', 'evaluate'], 'an evaluator follows a learner: play to the learner too'),
         (['--run', 'another'], "holds 0 runs 'another' to be played (there are: run)"),
     ],

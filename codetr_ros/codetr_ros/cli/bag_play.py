@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,6 +13,7 @@ from codetr_ros import middleware
 from codetr_ros.cli import refuse
 
 DEFAULT_NAMESPACE = '/play'
+_NAMESPACE = re.compile(r'/|(/[A-Za-z_][A-Za-z0-9_]*)+')
 
 
 def _option(said: str, metavar: str | None = None) -> object:
@@ -62,6 +64,11 @@ def main(arguments: Sequence[str]) -> int:
         return refuse(f'--rate {given.rate:g} must be greater than 0')
     if not 0 <= given.deadline <= 86_400:
         return refuse(f'--deadline {given.deadline:g} must be from 0 to 86400')
+    if not _NAMESPACE.fullmatch(given.namespace):
+        return refuse(
+            f'--namespace {given.namespace!r} must be as ROS has them: /name, of letters, digits '
+            'and _, not beginning with a digit'
+        )
     if live != given.to and live:
         return refuse(f'--to {" ".join(given.to)}: either nobody, or nodes')
     if 'evaluate' in live and 'learner' not in live:
