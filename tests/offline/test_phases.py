@@ -95,6 +95,18 @@ def test_a_phase_that_is_not_whole_is_named_and_not_learnt_from(a_run, tmp_path,
     assert '--schedule epochs' in said
 
 
+def test_a_damaged_summary_beside_the_bag_is_refused_before_anything_is_learnt(
+    a_run, tmp_path, capsys
+):
+    bag = write(tmp_path / 'run' / 'bag', a_run.records)
+    (tmp_path / 'run' / 'summary.json').write_text('{')
+
+    fit(bag, tmp_path / 'out', code=2)
+
+    assert 'summary.json cannot be read as JSON' in capsys.readouterr().err
+    assert not (tmp_path / 'out').exists()
+
+
 def test_two_runs_in_a_bag_must_be_told_apart(a_run, tmp_path, capsys):
     other = a_run.settings.run_spec('other')
     bag = write(tmp_path / 'bag', [*a_run.records, other])

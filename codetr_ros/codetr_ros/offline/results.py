@@ -44,14 +44,20 @@ def peak_mb() -> float:
 
 
 def live_digest(bag: Bag) -> str | None:
-    """The digest that the run itself ended with, where the bag still lies in the run's folder."""
+    """The digest that the run itself ended with, where the bag still lies in the run's folder.
+
+    Raises:
+        RunFolderError: the run's summary cannot be read.
+    """
     path = bag.path.parent / run_folder.SUMMARY
     if not path.is_file():
         return None
     try:
         said = json.loads(path.read_text())
-    except ValueError as error:
-        raise RunFolderError(f'{path} is not JSON ({error}): move the bag elsewhere') from None
+    except (OSError, ValueError) as error:
+        raise RunFolderError(
+            f'{path} cannot be read as JSON ({error}): move the bag elsewhere'
+        ) from None
     found = said.get(DIGEST) if isinstance(said, dict) else None
     return found if isinstance(found, str) else None
 
@@ -95,6 +101,7 @@ def of_phases(
     fit: FitSettings,
     judged: Judgement | None,
     seconds: float,
+    live: str | None,
 ) -> dict[str, Any]:
     """The summary of a fit that learnt as the run did."""
     report = folded.core.report()
@@ -112,7 +119,7 @@ def of_phases(
         'curve': [{'gradient_steps': n, 'loss': loss} for n, loss in folded.losses],
         'judged_on': 'on data that it was trained on',
         DIGEST: report.get(DIGEST),
-        'live_' + DIGEST: live_digest(index.bags[0]),
+        'live_' + DIGEST: live,
         'recorded_labels': {'same': folded.recorded.same, 'other': folded.recorded.other},
         'wall_s': seconds,
     }
