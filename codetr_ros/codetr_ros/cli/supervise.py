@@ -8,7 +8,7 @@ from types import FrameType, TracebackType
 from typing import Any
 
 from codetr_ros import run_folder
-from codetr_ros.launcher import Node, Processes
+from codetr_ros.launcher import ENDED_WELL, Node, Processes
 from codetr_ros.records import Presence, Record
 
 SILENCE_DEADLINE = 90.0
@@ -90,7 +90,7 @@ def supervise(
         poll: hands on what arrived and waits a moment for more.
         interrupts: whether the user has asked to stop.
         silence: fed by `poll`.
-        gave_up: of a node that ended with exit code 0: why it did so before the run was over, or
+        gave_up: of a node that ended well: why it did so before the run was over, or
             None.
         deadline: seconds of silence after which nodes that have not ended with the others are
             ended.
@@ -99,6 +99,7 @@ def supervise(
         Why the run failed; None if it finished or was interrupted.
     """
     ended = 0
+    hung: list[Node] = []
     while True:
         poll()
         if interrupts.count:
@@ -106,10 +107,14 @@ def supervise(
             processes.stop()
             return _after_stop(processes)
         running = processes.running()
+        for node in processes.nodes:
+            if node.code == -signal.SIGALRM and node not in hung:
+                hung.append(node)
+                processes.say(f'{node.name} had saved everything; then its middleware hung')
         if (failed := processes.failed()) is not None:
             return _stop_all(processes, failed.how_it_ended())
         for node in processes.nodes:
-            if node.code == 0 and (reason := gave_up(node)) is not None:
+            if node.code in ENDED_WELL and (reason := gave_up(node)) is not None:
                 return _stop_all(processes, reason)
         if not running:
             return None
@@ -133,7 +138,7 @@ def _stop_all(processes: Processes, reason: str) -> str:
 def _after_stop(processes: Processes) -> str | None:
     """An interrupted run has failed only where a node did not end as it should."""
     # SIGINT itself ends a process that has not yet come so far as to handle it.
-    clean = (0, -signal.SIGINT)
+    clean = (*ENDED_WELL, -signal.SIGINT)
     odd = [node.how_it_ended() for node in processes.nodes if node.code not in clean]
     return '; '.join(odd) or None
 

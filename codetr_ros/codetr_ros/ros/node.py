@@ -32,6 +32,7 @@ from codetr_ros.ros.signals import Stop
 
 ACK_DEADLINE = 5.0  # [s] at the end for readers that have not everything yet
 STOPPED_DEADLINE = 0.1  # [s] the same when the process was asked to stop
+SHUTDOWN_DEADLINE = 20  # [s] for the middleware to let go, once everything is saved and said
 LAST_WORDS = 5  # times that the last presence is said: so many make the middleware ask for answers
 
 
@@ -129,6 +130,7 @@ class CoreNode(Joining):
                 self._say_fatal(problem, 'at the end: ')
         if self.stop.signal and not error and not finished:
             self.log.info(f'stopped by {self.stop.signal.name}')
+        self.stop.end_within(SHUTDOWN_DEADLINE)
         self.link.close()
         return 1 if error else 0
 

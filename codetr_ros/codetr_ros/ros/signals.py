@@ -17,6 +17,7 @@ class Stop:
 
     def __init__(self) -> None:
         self.signal: signal.Signals | None = None
+        self._installed = False
 
     def __bool__(self) -> bool:
         return self.signal is not None
@@ -29,7 +30,19 @@ class Stop:
         """Take the two signals; call it first of all, before anything slow is imported."""
         for number in SIGNALS:
             signal.signal(number, self._note)
+        self._installed = True
         return self
+
+    def end_within(self, seconds: int) -> None:
+        """Have the kernel end this process with SIGALRM if it is still there after that long.
+
+        For its last moments, when everything is saved: a middleware that hangs while it shuts down
+        (seen, rarely, under load) holds the interpreter, and nothing written in Python could end
+        it.
+        """
+        if self._installed:
+            signal.signal(signal.SIGALRM, signal.SIG_DFL)
+            signal.alarm(seconds)
 
 
 def ignore() -> None:
