@@ -37,9 +37,6 @@ class FromLabels(OffPolicy):
     def _prepare(self, memory: Trajectories) -> bool:
         return memory.labelled_steps > 0
 
-    def _update(self, memory: Trajectories, rng: np.random.Generator) -> dict[str, Tensor]:
-        return self._burst(memory, rng, 1)
-
     def _burst(
         self, memory: Trajectories, rng: np.random.Generator, updates: int
     ) -> dict[str, Tensor]:

@@ -44,7 +44,7 @@ from codetr_ros import seeding
 from codetr_ros.config import Settings
 from codetr_ros.learners import network
 from codetr_ros.learners.histories import HISTORIES, HistoryBatch, ScoredSteps
-from codetr_ros.learners.learner import OffPolicy, check_state
+from codetr_ros.learners.learner import OffPolicy, add, check_state
 from codetr_ros.learners.sac import Adam, q_values, squashed_gaussian, twin_critic
 from codetr_ros.rewards.method import measure_scale
 from codetr_ros.trajectories import Trajectories
@@ -118,10 +118,15 @@ class HC(OffPolicy):
             self.target_scale = measure_scale(self._settings.target_scale, memory)
         return True
 
-    def _update(self, memory: Trajectories, rng: np.random.Generator) -> dict[str, Tensor]:
+    def _burst(
+        self, memory: Trajectories, rng: np.random.Generator, updates: int
+    ) -> dict[str, Tensor]:
         assert self._steps is not None
-        batch = self._settings.sac.batch
-        return self.update(self._steps.sample(rng, self._settings.hc.segments, batch))
+        totals: dict[str, Tensor] = {}
+        for _ in range(updates):
+            batch = self._steps.sample(rng, self._settings.hc.segments, self._settings.sac.batch)
+            add(totals, self.update(batch))
+        return totals
 
     def update(self, batch: HistoryBatch) -> dict[str, Tensor]:
         """One update of everything. What is random comes from torch's global generator.

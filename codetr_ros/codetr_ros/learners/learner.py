@@ -87,21 +87,14 @@ class OffPolicy(ABC):
         """
 
     @abstractmethod
-    def _update(self, memory: Trajectories, rng: np.random.Generator) -> dict[str, Tensor]:
-        """One update from a batch drawn with `rng`; torch's global generator is seeded.
-
-        Returns:
-            Scalar tensors: their means over the phase are its metrics.
-        """
-
     def _burst(
         self, memory: Trajectories, rng: np.random.Generator, updates: int
     ) -> dict[str, Tensor]:
-        """Updates in a row: the sums of what each of them says."""
-        totals: dict[str, Tensor] = {}
-        for _ in range(updates):
-            _add(totals, self._update(memory, rng))
-        return totals
+        """Updates in a row, from batches drawn with `rng`; torch's global generator is seeded.
+
+        Returns:
+            Scalar tensors, summed over the updates: their means over the phase are its metrics.
+        """
 
     def train(self, phase: int, memory: Trajectories) -> Iterator[dict[str, float]]:
         """As many updates as the phase asks for, or none where there is nothing to draw.
@@ -122,7 +115,7 @@ class OffPolicy(ABC):
             rng = generator(settings.seed, 'learner', phase, done)
             seed_torch(settings.seed, 'learner', phase, done)
             burst = min(settings.sac.burst, due - done)
-            _add(totals, self._burst(memory, rng, burst))
+            add(totals, self._burst(memory, rng, burst))
             done += burst
             self.updates += burst
             yield {}
@@ -136,7 +129,8 @@ class OffPolicy(ABC):
         yield means | {'update_seconds': time.perf_counter() - began}
 
 
-def _add(totals: dict[str, Tensor], values: Mapping[str, Tensor]) -> None:
+def add(totals: dict[str, Tensor], values: Mapping[str, Tensor]) -> None:
+    """Add values to totals of the same names."""
     for name, value in values.items():
         totals[name] = totals.get(name, torch.zeros(())) + value
 
