@@ -3,25 +3,21 @@
 It is fed with the run's records, whoever carries them; it knows nothing of ROS.
 """
 
-import sys
 import time
 from collections import deque
 from collections.abc import Callable
-from types import TracebackType
 from typing import TextIO
 
 import numpy as np
-from rich.console import Console, RenderableType
-from rich.live import Live
+from rich.console import RenderableType
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
 from codetr_ros.config import Settings
+from codetr_ros.display import Display
 from codetr_ros.records import Commit, EpisodeResult, Metrics, Presence, Record
 
-_PLAIN_EVERY = 5.0  # seconds between plain lines that no evaluation asks for
-_LIVE_EVERY = 0.25  # seconds between changes of the display
 _RATE_WINDOW = 5  # phases over which the present speed is measured
 
 
@@ -35,7 +31,7 @@ def duration(seconds: float) -> str:
     return f'{whole // 3600}:{whole % 3600 // 60:02d} h'
 
 
-class Progress:
+class Progress(Display):
     """Shows how a run is doing.
 
     Args:
@@ -45,6 +41,9 @@ class Progress:
         clock: seconds, never going back.
     """
 
+    plain_every = 5.0
+    live_every = 0.25
+
     def __init__(
         self,
         settings: Settings,
@@ -53,14 +52,7 @@ class Progress:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._settings = settings
-        self._stream = stream or sys.stdout
-        self._console = Console(file=self._stream)
-        wanted = self._console.is_terminal if live is None else live
-        # No thread of its own: records and the display would have to be kept from each other.
-        self._live = Live(console=self._console, auto_refresh=False) if wanted else None
-        self._clock = clock
-        self._began = clock()
-        self._shown = self._began
+        super().__init__(stream, live, clock)
         self._phase = 0
         self._marks: deque[tuple[float, int]] = deque([(self._began, 0)], maxlen=_RATE_WINDOW + 1)
         self._metrics: dict[str, float] = {}
@@ -71,25 +63,10 @@ class Progress:
         self._note = 'starting'
 
     def __enter__(self) -> 'Progress':
+        super().__enter__()
         if self._live is not None:
-            self._live.start()
             self.tick()
         return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if self._live is not None:
-            self._live.update(self._render(), refresh=True)
-            self._live.stop()
-
-    def say(self, text: str, style: str = '') -> None:
-        """Show a line above the display, to stay."""
-        self._console.print(Text(text, style=style), soft_wrap=True)
-        self._stream.flush()
 
     def receive(self, record: Record) -> None:
         """Take note of a record of the run."""
@@ -107,17 +84,6 @@ class Progress:
             self._present[record.node] = record.role
             self._missed[record.node] = record.missed
         self.tick()
-
-    def tick(self) -> None:
-        """Show how things are, if it is time; to be called now and then while nothing arrives."""
-        now = self._clock()
-        if now - self._shown < (_PLAIN_EVERY if self._live is None else _LIVE_EVERY):
-            return
-        self._shown = now
-        if self._live is None:
-            self._plain()
-        else:
-            self._live.update(self._render(), refresh=True)
 
     def _take(self, result: EpisodeResult) -> None:
         if result.purpose == 'random':

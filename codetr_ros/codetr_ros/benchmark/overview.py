@@ -1,26 +1,21 @@
 """How a benchmark is doing: a display that changes in place on a terminal, else plain lines."""
 
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from types import TracebackType
 from typing import Any, TextIO
 
-from rich.console import Console, RenderableType
-from rich.live import Live
+from rich.console import RenderableType
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
 from codetr_ros.benchmark.attempt import Job, phases_in, running
 from codetr_ros.benchmark.folder import Folder
+from codetr_ros.display import Display
 from codetr_ros.progress import duration
 
-_PLAIN_EVERY = 30.0  # seconds between plain lines while nothing ends
-_LIVE_EVERY = 0.5  # seconds between changes of the display
 
-
-class Overview:
+class Overview(Display):
     """Shows which cells are done, run, have failed, and how long it will take.
 
     Args:
@@ -32,6 +27,9 @@ class Overview:
         clock: seconds, never going back.
     """
 
+    plain_every = 30.0
+    live_every = 0.5
+
     def __init__(
         self,
         folder: Folder,
@@ -42,12 +40,7 @@ class Overview:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._folder = folder
-        self._stream = stream or sys.stdout
-        self._console = Console(file=self._stream)
-        wanted = self._console.is_terminal if live is None else live
-        self._live = Live(console=self._console, auto_refresh=False) if wanted else None
-        self._clock = clock
-        self._began = self._shown = clock()
+        super().__init__(stream, live, clock)
         self._total = len(jobs) + done
         self._steps_total = sum(job.steps for job in jobs)
         self._steps_done = 0  # of cells that have ended since the beginning, failed ones included
@@ -55,26 +48,6 @@ class Overview:
         self._running: dict[str, tuple[Job, float]] = {}  # by cell, with its start
         self.failed: dict[str, str] = {}
         """Cells that failed, and why."""
-
-    def __enter__(self) -> 'Overview':
-        if self._live is not None:
-            self._live.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if self._live is not None:
-            self._live.update(self._render(), refresh=True)
-            self._live.stop()
-
-    def say(self, text: str, style: str = '') -> None:
-        """Show a line above the display, to stay."""
-        self._console.print(Text(text, style=style), soft_wrap=True)
-        self._stream.flush()
 
     def started(self, job: Job) -> None:
         """A cell begins; one that begins again is counted once."""
@@ -96,17 +69,9 @@ class Overview:
         for line in (ending['log'] or '').splitlines():
             self.say(f'    {line}', 'dim')
 
-    def tick(self) -> None:
-        """Show how things are, if it is time."""
-        now = self._clock()
-        if now - self._shown < (_PLAIN_EVERY if self._live is None else _LIVE_EVERY):
-            return
-        self._shown = now
-        if self._live is None:
-            shown = ', '.join(f'{cell} {share:.0%}' for cell, share, _ in self._progress())
-            self.say(self._counts() + (f'; running: {shown}' if shown else ''))
-        else:
-            self._live.update(self._render(), refresh=True)
+    def _plain(self) -> None:
+        shown = ', '.join(f'{cell} {share:.0%}' for cell, share, _ in self._progress())
+        self.say(self._counts() + (f'; running: {shown}' if shown else ''))
 
     def _progress(self) -> list[tuple[str, float, float]]:
         """Each running cell with the share of its phases learnt from and its seconds so far."""
