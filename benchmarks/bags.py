@@ -26,13 +26,10 @@ process itself worked, which other work on the machine changes less.
 import argparse
 import csv
 import os
-import platform
 import shutil
-import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +38,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 
+import machine
 from codetr_ros.bags.definitions import encode, own_types
 from codetr_ros.bags.info import survey
 from codetr_ros.bags.reader import Bag
@@ -64,8 +62,6 @@ from codetr_ros.records import (
 from codetr_ros.trajectories import Trajectories
 
 PHASE, CHUNK, DELAY, ACTIONS = 1000, 500, 25, 8
-LOUD = 0.5
-"""Load average above which the machine is not idle."""
 COLUMNS = ('what', 'by', 'observations', 'steps', 'seconds', 'cpu_s', 'steps_per_s', 'MB_per_s')
 
 
@@ -264,18 +260,10 @@ def check_sound(folder: Path) -> None:
     assert verdict.sound, verdict.findings.named[:3]
 
 
-def circumstances() -> str:
+def circumstances(load_at_start: str) -> str:
     """Of what, and where, this is measured."""
-    commit = subprocess.run(
-        ['git', 'rev-parse', '--short', 'HEAD'], capture_output=True, text=True, check=False
-    ).stdout.strip()
-    packages = ', '.join(f'{name} {version(name)}' for name in ('rosbags', 'mcap', 'numpy'))
-    load_average = os.getloadavg()[0]
-    busy = ': other work ran beside it, compare the CPU seconds' if load_average > LOUD else ''
-    return (
-        f'`benchmarks/bags.py` at {commit}, Python {platform.python_version()}, {packages}, '
-        f'{os.cpu_count()} cores, each once, load average {load_average:.1f} at the start{busy}.'
-    )
+    facts = machine.facts(load_at_start, ('rosbags', 'mcap', 'numpy'))
+    return f'`benchmarks/bags.py`, each once: {"; ".join(map(" ".join, facts.items()))}.'
 
 
 def table(rows: list[dict[str, Any]], about: str) -> str:
@@ -303,7 +291,7 @@ def main() -> None:
     parser.add_argument('--observations', type=int, nargs='+', default=[105, 27])
     parser.add_argument('--out', type=Path, help='folder for bags.csv and bags.md')
     given = parser.parse_args()
-    about = circumstances()
+    about = circumstances(machine.load())
     rows: list[dict[str, Any]] = []
     for observations in given.observations:
         with tempfile.TemporaryDirectory(prefix='codetr-bags-') as folder:

@@ -38,6 +38,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import machine
 from codetr_ros.config import IN_PROCESS_ONLY, Settings, SettingsError, load
 
 RESULTS = Path(__file__).parent / 'results' / 'default_task'
@@ -66,15 +67,6 @@ class ResultsError(ValueError):
     """Results that do not belong together or are not there: names the files and says what to
     do.
     """
-
-
-def commit() -> str:
-    """The commit that is measured, marked where tracked files have been changed."""
-    command = ['git', 'describe', '--always', '--dirty', '--exclude', '*']
-    here = Path(__file__).parent
-    return subprocess.run(
-        command, cwd=here, capture_output=True, text=True, check=True
-    ).stdout.strip()
 
 
 def changes_of(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -136,7 +128,7 @@ def run(arguments: argparse.Namespace) -> int:
     folder = arguments.out / 'runs'
     folder.mkdir(parents=True, exist_ok=True)
     base = load(arguments.config)
-    measured = commit()
+    measured = machine.commit()
     jobs: list[tuple[Settings, list[str], Path]] = []
     for seed in arguments.seeds:
         for method in arguments.methods:

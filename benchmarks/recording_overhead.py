@@ -20,7 +20,6 @@ ratio of cpu and the part that is sync, and repeat the rest on a quiet one.
 import argparse
 import json
 import os
-import platform
 import resource
 import statistics
 import sys
@@ -29,6 +28,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
+import machine
 from codetr_ros import launcher, run_folder
 from codetr_ros.config import Settings, load
 from codetr_ros.records import Commit, Metrics, Record
@@ -36,8 +36,6 @@ from codetr_ros.ros.watch import Watcher
 
 RESULTS = Path(__file__).parent / 'results' / 'recording_overhead.md'
 DEADLINE = 1800.0  # [s] for one run
-LOUD = 0.5
-"""Load average above which the machine is not idle."""
 
 
 class Run(NamedTuple):
@@ -147,10 +145,8 @@ def main() -> int:
     settings = load(given.config)
     if given.steps:
         settings = settings.changed({'steps': given.steps}, 'command line')
-    at_start = os.getloadavg()[0]
-    loud = ' (the machine was NOT idle)' if at_start > LOUD else ''
-    if loud:
-        print(f'WARNING: the load average is {at_start:.2f}{loud}', file=sys.stderr, flush=True)
+    load_at_start = machine.load()
+    print(f'load average at the start: {load_at_start}', flush=True)
     os.environ.update(launcher.environment(settings))
     pairs = []
     for i in range(given.pairs):
@@ -162,9 +158,7 @@ def main() -> int:
         pairs,
         {
             'run': f'{given.config}, {settings.task}, {settings.steps} steps',
-            'cores': str(len(os.sched_getaffinity(0))),
-            'load average at the start': f'{at_start:.2f}{loud}',
-            'system': platform.platform(),
+            **machine.facts(load_at_start, ('numpy', 'torch', 'mcap')),
         },
     )
     print(text, end='')

@@ -22,13 +22,13 @@ Rows that are in the file already are not run again. Means over seeds go beside 
 import argparse
 import csv
 import math
-import subprocess
 import time
 from pathlib import Path
 
 import numpy as np
 import torch
 
+import machine
 from codetr_ros import in_process, rewards
 from codetr_ros.composite import composite
 from codetr_ros.config import Settings, load
@@ -205,9 +205,7 @@ def main() -> None:
     parser.add_argument('--gradient-steps', nargs='+', type=int, default=[400])
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    commit = subprocess.run(
-        ['git', 'rev-parse', '--short', 'HEAD'], capture_output=True, text=True, check=True
-    ).stdout.strip()
+    commit = machine.commit()
     data = replay(arguments.cache)
     done = set()
     if arguments.out.is_file():

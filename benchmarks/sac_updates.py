@@ -28,7 +28,6 @@ import argparse
 import csv
 import json
 import os
-import platform
 import statistics
 import subprocess
 import sys
@@ -41,6 +40,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+import machine
 
 RESULTS = Path(__file__).parent / 'results' / 'sac_updates'
 STEPS, EPISODE = 100_000, 1000
@@ -319,13 +320,6 @@ def write(rows: list[dict[str, Any]], arguments: argparse.Namespace, load: str) 
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    commit = subprocess.run(
-        ['git', 'rev-parse', '--short', 'HEAD'],
-        check=False,
-        capture_output=True,
-        text=True,
-        cwd=Path(__file__).parent,
-    ).stdout.strip()
     versions: dict[str, str] = {}
     for row in rows:
         versions |= json.loads(row['versions'])
@@ -336,8 +330,8 @@ def write(rows: list[dict[str, Any]], arguments: argparse.Namespace, load: str) 
     text = [
         '# SAC updates per second, sampling included',
         '',
-        f'{platform.processor() or platform.machine()}, {os.cpu_count()} cores; '
-        f'{", ".join(f"{n} {v}" for n, v in versions.items())}; commit {commit}; '
+        f'{machine.processor()}, {os.cpu_count()} cores; '
+        f'{", ".join(f"{n} {v}" for n, v in versions.items())}; commit {machine.commit()}; '
         f'{arguments.rounds} rounds, {arguments.clock} time; load average {load}.',
         'Median round; ratios: median [lowest, highest] of rounds. What is compared: '
         '`benchmarks/sac_updates.py`.',
@@ -365,14 +359,14 @@ def main() -> None:
     if arguments.work:
         work(arguments.work, Size(**arguments.size))
         return
-    before = os.getloadavg()[0]
+    before = machine.load()
     print(HEAD, flush=True)
     rows = []
     for size in sizes():
         named = f'{size.task} {size.observation} {size.width}'
         if size.threads in arguments.threads and arguments.only in named:
             rows += measure(size, arguments)
-    write(rows, arguments, f'{before:.1f} before, {os.getloadavg()[0]:.1f} at the end')
+    write(rows, arguments, f'{before} before, {os.getloadavg()[0]:.1f} at the end')
 
 
 if __name__ == '__main__':

@@ -40,21 +40,19 @@ measures the parts only, and writes nothing.
 import argparse
 import csv
 import json
-import os
-import platform
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+import machine
 from codetr_ros import rewards, tasks
 from codetr_ros.config import Settings, load
 from codetr_ros.learners.flat_sac import FlatSAC
@@ -64,8 +62,6 @@ from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.trajectories import Trajectories
 
 RESULTS = Path(__file__).parent / 'results'
-LOUD = 0.5
-"""Load average above which the machine is not idle."""
 PACKAGES = ('torch', 'numpy', 'mujoco', 'gymnasium')
 MARKED = Path(__file__).with_name('marked_train.py')
 WORK = ('simulate_seconds', 'fit_seconds', 'label_seconds', 'update_seconds')
@@ -319,30 +315,11 @@ def table(
     return rows
 
 
-def circumstances(settings: Settings, flags: list[str], load_average: float) -> dict[str, str]:
+def circumstances(settings: Settings, flags: list[str], load_at_start: str) -> dict[str, str]:
     """What the numbers depend on."""
-    here = Path(__file__).parent
-    commit = subprocess.run(
-        ['git', 'describe', '--always', '--dirty', '--exclude', '*'],
-        cwd=here,
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout.strip()
-    model = platform.processor() or platform.machine()
-    if (info := Path('/proc/cpuinfo')).is_file():
-        lines = info.read_text().splitlines()
-        model = next((x.split(':')[1].strip() for x in lines if x.startswith('model name')), model)
     evaluations = sum(map(settings.evaluated, range(settings.phases))) + 1
     return {
-        'cpu': model,
-        'cores': str(len(os.sched_getaffinity(0))),
-        'load average at the start': f'{load_average:.2f}'
-        + (' (the machine was NOT idle)' if load_average > LOUD else ''),
-        'system': platform.platform(),
-        'python': platform.python_version(),
-        **{name: version(name) for name in PACKAGES},
-        'commit': commit,
+        **machine.facts(load_at_start, PACKAGES),
         'run': f'codetr train {" ".join(flags)}',
         'evaluations in both whole runs': f'{evaluations}, that of the random policy included; '
         f'episodes in each: {settings.evaluate_episodes}',
@@ -390,14 +367,12 @@ def main() -> int:
     parser.add_argument('--no-runs', action='store_true', help='the parts only, write nothing')
     parser.add_argument('--out', type=Path, default=RESULTS)
     arguments = parser.parse_args()
-    load_average = os.getloadavg()[0]
-    if load_average > LOUD:
-        text = f'WARNING: the load average is {load_average:.2f}: the machine is not idle, and '
-        print(f'{text}neither rates nor ratios are to be trusted', file=sys.stderr, flush=True)
+    load_at_start = machine.load()
+    print(f'load average at the start: {load_at_start}', file=sys.stderr, flush=True)
     settings = load(arguments.config).changed({'steps': arguments.steps}, 'command line')
     torch.set_num_threads(settings.threads)
     flags = ['--config', arguments.config, '--steps', str(arguments.steps)]
-    facts = circumstances(settings, flags, load_average)
+    facts = circumstances(settings, flags, load_at_start)
     measured = Parts(settings)
     parts: list[Rates] = []
     runs: dict[bool, list[dict[str, float]]] = {True: [], False: []}

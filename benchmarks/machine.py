@@ -1,0 +1,57 @@
+"""Where and of what a benchmark's numbers were measured: what stands beside every table here."""
+
+import os
+import platform
+import subprocess
+from collections.abc import Iterable
+from importlib.metadata import version
+from pathlib import Path
+
+LOUD = 0.5
+"""Load average above which a machine is not idle."""
+
+
+def commit() -> str:
+    """The commit that is measured, marked where tracked files have been changed."""
+    return subprocess.run(
+        ['git', 'describe', '--always', '--dirty', '--exclude', '*'],
+        cwd=Path(__file__).parent,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.strip()
+
+
+def processor() -> str:
+    """The processor's name, as far as the system tells."""
+    if (info := Path('/proc/cpuinfo')).is_file():
+        for line in info.read_text().splitlines():
+            if line.startswith('model name'):
+                return line.split(':')[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def load() -> str:
+    """The load average of the last minute: ask at the start. Says where it is not an idle
+    machine's.
+    """
+    average = os.getloadavg()[0]
+    return f'{average:.2f}' + (' (the machine was NOT idle)' if average > LOUD else '')
+
+
+def facts(load_at_start: str, packages: Iterable[str] = ()) -> dict[str, str]:
+    """What the numbers depend on, by name.
+
+    Args:
+        load_at_start: What `load` said before the measurement.
+        packages: Distributions whose versions matter.
+    """
+    return {
+        'cpu': processor(),
+        'cores': str(len(os.sched_getaffinity(0))),
+        'load average at the start': load_at_start,
+        'system': platform.platform(),
+        'python': platform.python_version(),
+        **{name: version(name) for name in packages},
+        'commit': commit(),
+    }
