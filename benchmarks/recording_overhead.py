@@ -9,18 +9,20 @@ For each run are given
 
   - loop: seconds from the first commit to the learner's last word, as a watcher hears them; what
     starting and ending take is left out
-  - cpu: CPU seconds of all processes together, which other load on the machine disturbs less
-  - sync: what the recorder says it spent in syncing before commits (A only); as a part of the
-    loop it is the cost of recording that no other core can take over
+  - rest: the loop less what the nodes say that they simulated, fitted, labelled and learnt. In
+    lock-step one of them works at a time, so that what is left is transport and the recorder:
+    whatever recording costs the others is in here. How fast one and the same program learns
+    differs by several per cent from process to process, by chance, and does not disturb it
+  - recorder: CPU seconds of the recorder's process
+  - sync: seconds that the recorder says it spent in syncing before commits (with a bag only)
 
-and the ratios A / B, lowest, median and highest pair. On a machine that is not idle, read the
-ratio of cpu and the part that is sync, and repeat the rest on a quiet one.
+Recording costs (rest with a bag - rest without) / loop in time, and the same of `recorder` in
+CPU. The ratio of the loops themselves is given too: it is as uncertain as its range shows.
 """
 
 import argparse
 import json
 import os
-import resource
 import statistics
 import sys
 import tempfile
@@ -36,31 +38,40 @@ from codetr_ros.ros.watch import Watcher
 
 RESULTS = Path(__file__).parent / 'results' / 'recording_overhead.md'
 DEADLINE = 1800.0  # [s] for one run
+WORK = ('simulate_seconds', 'fit_seconds', 'label_seconds', 'update_seconds')
+"""What nodes say of their own work in `Metrics`; evaluation delays nobody."""
 
 
 class Run(NamedTuple):
     """One run's times [s], and the size of its bag."""
 
     loop: float
-    cpu: float
+    rest: float
+    recorder: float
     sync: float
     megabytes: float
 
 
 class Clock:
-    """When the first commit and the learner's last metrics were heard."""
+    """When the first commit and the learner's last metrics were heard, and the work between."""
 
     def __init__(self, phases: int) -> None:
         self._last = 'learner', phases - 1
         self.first: float | None = None
         self.last: float | None = None
+        self.work = 0.0
 
     def hear(self, record: Record) -> None:
         """Take note of a record."""
         if isinstance(record, Commit) and self.first is None:
             self.first = time.perf_counter()
-        elif isinstance(record, Metrics) and (record.role, record.phase) == self._last:
+        if not isinstance(record, Metrics):
+            return
+        if (record.role, record.phase) == self._last:
             self.last = time.perf_counter()
+        if (record.role, record.phase) != ('sim', 0):  # was over before the first commit
+            said = dict(zip(record.names, record.values.tolist(), strict=True))
+            self.work += sum(said.get(name, 0.0) for name in WORK)
 
 
 def without_folder(command: launcher.Command) -> launcher.Command:
@@ -74,7 +85,7 @@ def one_run(settings: Settings, bag: bool, number: int) -> Run:
     """Make a run and measure it."""
     clock = Clock(settings.phases)
     run_id = f'overhead_{os.getpid()}_{number}'
-    began = cpu_of_children()
+    recorder = 0.0
     with tempfile.TemporaryDirectory(prefix='codetr-overhead-') as where:
         folder = run_folder.create(Path(where) / 'run')
         run_folder.write_settings(folder, settings)
@@ -89,6 +100,7 @@ def one_run(settings: Settings, bag: bool, number: int) -> Run:
             end = time.monotonic() + DEADLINE
             while processes.running() and not processes.failed():
                 watcher.poll(0.1)
+                recorder = max([recorder, *map(cpu_of, processes.running())])
                 if time.monotonic() > end:
                     raise SystemExit(f'a run took more than {DEADLINE:g} s')
         if failed := processes.failed():
@@ -100,34 +112,48 @@ def one_run(settings: Settings, bag: bool, number: int) -> Run:
             path = run_folder.report_path(folder, 'record', 'record')
             report = json.loads(path.read_text())
             sync, size = report['flush_seconds'], report['bag_bytes'] / 1e6
-    return Run(clock.last - clock.first, cpu_of_children() - began, sync, size)
+    loop = clock.last - clock.first
+    return Run(loop, loop - clock.work, recorder, sync, size)
 
 
-def cpu_of_children() -> float:
-    """CPU seconds of all processes that have been started and have ended."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
+def cpu_of(node: launcher.Node) -> float:
+    """CPU seconds of a recorder's process so far; 0 for other nodes and ended ones."""
+    if node.role != 'record':
+        return 0.0
+    try:
+        stat = Path(f'/proc/{node.process.pid}/stat').read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return 0.0
+    user, system = stat.rpartition(')')[2].split()[11:13]
+    return (int(user) + int(system)) / os.sysconf('SC_CLK_TCK')
 
 
 def table(pairs: list[tuple[Run, Run]], facts: dict[str, str]) -> str:
     """All pairs, and what they come to."""
+    names = ('loop', 'rest', 'recorder')
+    head = [f'{name} {how} [s]' for name in names for how in ('with', 'without')]
     lines = [
         '# What recording costs',
         '',
-        '| pair | loop with bag [s] | without [s] | ratio | cpu with bag [s] | without [s] '
-        '| ratio | sync [s] | of the loop |',
-        '|---' * 9 + '|',
+        f'| pair | {" | ".join(head)} | sync [s] |',
+        '|---|' + '---:|' * (len(head) + 1),
     ]
     for i, (a, b) in enumerate(pairs, 1):
-        lines.append(
-            f'| {i} | {a.loop:.2f} | {b.loop:.2f} | {a.loop / b.loop:.3f} | {a.cpu:.2f} '
-            f'| {b.cpu:.2f} | {a.cpu / b.cpu:.3f} | {a.sync:.3f} | {a.sync / a.loop:.2%} |'
-        )
-    for what in ('loop', 'cpu'):
-        ratios = [getattr(a, what) / getattr(b, what) for a, b in pairs]
-        facts[f'{what}, with bag / without'] = (
-            f'median {statistics.median(ratios):.3f}, {min(ratios):.3f} to {max(ratios):.3f}'
-        )
+        cells = [f'{getattr(run, name):.2f}' for name in names for run in (a, b)]
+        lines.append(f'| {i} | {" | ".join(cells)} | {a.sync:.3f} |')
+    costs = {
+        f'{name}: (with - without) / loop': [
+            (getattr(a, name) - getattr(b, name)) / b.loop for a, b in pairs
+        ]
+        for name in ('rest', 'recorder')
+    }
+    costs['sync / loop'] = [a.sync / a.loop for a, _ in pairs]
+    for name, of in costs.items():
+        facts[name] = f'median {statistics.median(of):.2%}, {min(of):.2%} to {max(of):.2%}'
+    ratios = [a.loop / b.loop for a, b in pairs]
+    facts['loop with / without'] = (
+        f'median {statistics.median(ratios):.3f}, {min(ratios):.3f} to {max(ratios):.3f}'
+    )
     facts['bag'] = f'{statistics.median(a.megabytes for a, _ in pairs):.1f} MB'
     return '\n'.join([*lines, '', *(f'- {name}: {fact}' for name, fact in facts.items())]) + '\n'
 
