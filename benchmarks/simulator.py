@@ -1,0 +1,332 @@
+"""How near is a simulated step to what its physics costs, and what does acting cost?
+
+    .venv/bin/python benchmarks/simulator.py                    # on an idle machine
+
+Everything is on one thread, and measured in rounds that go through all that is compared, in
+another order each time. A ratio is made of two measurements of one round; the tables give the
+median of the rounds, and the lowest and highest in brackets.
+
+Steps, for each Gymnasium MuJoCo task that has a name here, under the same random actions from the
+same starts (that all end in the same states is checked; resets are not timed):
+  - ours: `Episode.step`, with which simulators and the evaluator step: the scaled action, the
+    physics, observation, reward, termination, finite numbers, segments and scores
+  - floor: the physics and the observation alone, `mj_step` with the task's frame skip and the
+    environment's own `_get_obs`. Humanoid's observation has contact forces, so that its floor has
+    `mj_rnePostConstraint` as well
+  - gymnasium: `step` of what `gymnasium.make` gives
+
+Actions, of a policy of 256x256 with noise, one observation at a time, for the sizes of the same
+tasks:
+  - ours: `ActingPolicy.act`
+  - module: the network's forward pass and the same arithmetic, as a reader of PyTorch would write
+    it
+  - numpy: the same with numpy's products
+
+`--clock cpu` counts the time that the processor worked for this process instead of the time on
+the wall: for a machine that does other things as well.
+"""
+
+import argparse
+import csv
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import torch
+
+import machine
+from codetr_ros import tasks
+from codetr_ros.config import Settings
+from codetr_ros.learners.network import ActingPolicy, Actor, linear_layers
+from codetr_ros.records import F32
+from codetr_ros.rollout import Episode, uniform_actions
+from codetr_ros.seeding import generator
+
+RESULTS = Path(__file__).parent / 'results'
+PACKAGES = ('mujoco', 'gymnasium', 'numpy', 'torch')
+CLOCKS = {'wall': time.perf_counter, 'cpu': time.process_time}
+COLUMNS = ('what', 'task', 'name', 'round', 'calls', 'seconds')
+NAMES = [name for name, task in tasks.TASKS.items() if task.library == 'gymnasium']
+HIDDEN = (256, 256)
+CALLS = 2000
+"""Actions of a policy in a round."""
+
+
+@dataclass(frozen=True)
+class Player:
+    """Something that steps a task.
+
+    Attributes:
+        reset: begins an episode from a seed.
+        prepare: what `play` is to be given for actions in [-1, 1].
+        play: takes them; what is timed.
+        observation: the last one.
+    """
+
+    reset: Callable[[int], Any]
+    prepare: Callable[[F32], list[Any]]
+    play: Callable[[list[Any]], None]
+    observation: Callable[[], Any]
+
+
+def ours(name: str) -> Player:
+    """The loop of this project."""
+    environment = tasks.make(name)
+    episode = Episode(environment, Settings(task=name))
+
+    def play(actions: list[F32]) -> None:
+        step = episode.step
+        for action in actions:
+            step(action)
+
+    return Player(episode.reset, list, play, lambda: episode.observation)
+
+
+def floor(name: str) -> Player:
+    """Physics and observation alone."""
+    env: Any = gymnasium.make(name, disable_env_checker=True).unwrapped
+    model, data, frames, ctrl = env.model, env.data, env.frame_skip, env.data.ctrl
+    observe = env._get_obs  # noqa: SLF001
+    forces = name.startswith('Humanoid')
+
+    def play(actions: list[F32]) -> None:
+        for action in actions:
+            ctrl[:] = action
+            mujoco.mj_step(model, data, nstep=frames)
+            if forces:
+                mujoco.mj_rnePostConstraint(model, data)
+            observe()
+
+    return Player(
+        lambda seed: env.reset(seed=seed), lambda a: scaled(env.action_space, a), play, observe
+    )
+
+
+def plain(name: str) -> Player:
+    """Gymnasium, as people use it."""
+    env: Any = gymnasium.make(name)
+
+    def play(actions: list[F32]) -> None:
+        step = env.step
+        for action in actions:
+            step(action)
+
+    return Player(
+        lambda seed: env.reset(seed=seed),
+        lambda a: scaled(env.action_space, a),
+        play,
+        env.unwrapped._get_obs,  # noqa: SLF001
+    )
+
+
+def scaled(box: Any, actions: F32) -> list[F32]:
+    """Actions in [-1, 1] as an environment with these bounds takes them."""
+    return list((box.high + box.low) / 2 + (box.high - box.low) / 2 * actions)
+
+
+def episodes(name: str, steps: int) -> Iterator[tuple[int, F32]]:
+    """Seeds and actions of episodes under the random policy, of so many steps together."""
+    environment = tasks.make(name)
+    episode = Episode(environment, Settings(task=name))
+    seed = 0
+    while steps > 0:
+        episode.reset(seed)
+        most = min(steps, environment.horizon)
+        actions = uniform_actions(generator(0, name, seed), most, environment.action_size)
+        while episode.length < most and not episode.over:
+            episode.step(actions[episode.length])
+        yield seed, actions[: episode.length]
+        steps -= episode.length
+        seed += 1
+
+
+def step_rows(name: str, arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """All rounds of one task."""
+    clock = CLOCKS[arguments.clock]
+    players = {'ours': ours(name), 'floor': floor(name), 'gymnasium': plain(name)}
+    trace = list(episodes(name, arguments.steps))
+    prepared = {who: [p.prepare(a) for _, a in trace] for who, p in players.items()}
+    rows = []
+    for number in range(-1, arguments.rounds):  # round -1 does not count
+        seconds = {}
+        for who in turned(list(players), number):
+            player, spent = players[who], 0.0
+            for (seed, _), actions in zip(trace, prepared[who], strict=True):
+                player.reset(seed)
+                began = clock()
+                player.play(actions)
+                spent += clock() - began
+            seconds[who] = spent
+        ends = {
+            who: np.asarray(player.observation(), np.float32) for who, player in players.items()
+        }
+        if any((end != ends['ours']).any() for end in ends.values()):
+            raise SystemExit(f'{name}: what is compared does not end in the same state: {ends}')
+        rows += rows_of('step', name, number, arguments.steps, seconds)
+    return rows
+
+
+def actors(observation_size: int, action_size: int) -> dict[str, Callable[[F32, F32], Any]]:
+    """Ways of acting, all with the same weights."""
+    torch.manual_seed(0)
+    actor = Actor(observation_size, action_size, HIDDEN)
+    weights = [
+        (layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy())
+        for layer in linear_layers(actor)
+    ]
+
+    def module(observation: F32, noise: F32) -> F32:
+        with torch.no_grad():
+            mean, log_std = actor(torch.from_numpy(observation))
+            action: F32 = torch.tanh(mean + log_std.exp() * torch.from_numpy(noise)).numpy()
+        return action
+
+    def numpy(observation: F32, noise: F32) -> F32:
+        x = observation
+        for weight, bias in weights[:-1]:
+            x = np.maximum(weight @ x + bias, 0)
+        weight, bias = weights[-1]
+        mean, log_std = np.split(weight @ x + bias, 2)
+        return np.tanh(mean + np.exp(np.clip(log_std, -10, 2)) * noise)
+
+    return {'ours': ActingPolicy(actor).act, 'module': module, 'numpy': numpy}
+
+
+def action_rows(name: str, arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """All rounds of a policy for one task."""
+    clock = CLOCKS[arguments.clock]
+    environment = tasks.make(name)
+    sizes = environment.observation_size, environment.action_size
+    rng = generator(0, 'actions', name)
+    observations, noise = (
+        list(rng.standard_normal((CALLS, size), dtype=np.float32)) for size in sizes
+    )
+    ways = actors(*sizes)
+    rows = []
+    for number in range(-1, arguments.rounds):
+        seconds = {}
+        for who in turned(list(ways), number):
+            act = ways[who]
+            began = clock()
+            for o, e in zip(observations, noise, strict=True):
+                act(o, e)
+            seconds[who] = clock() - began
+        rows += rows_of('action', name, number, CALLS, seconds)
+    return rows
+
+
+def turned(names: list[str], number: int) -> list[str]:
+    """Names, another one first in each round."""
+    at = number % len(names)
+    return names[at:] + names[:at]
+
+
+def rows_of(
+    what: str, task: str, number: int, calls: int, seconds: dict[str, float]
+) -> list[dict[str, Any]]:
+    """The rows of a round; none of the one that does not count."""
+    if number < 0:
+        return []
+    return [
+        dict(zip(COLUMNS, (what, task, who, number, calls, f'{s:.6f}'), strict=True))
+        for who, s in seconds.items()
+    ]
+
+
+# ----------------------------------------------------------------------------------------------
+# the tables
+
+TABLES = {
+    'step': ('Steps', ('ours', 'floor', 'gymnasium'), ('floor', 'gymnasium')),
+    'action': ('Actions, one observation at a time', ('ours', 'module', 'numpy'), ('module',)),
+}
+"""For each kind of row: its title, whose times are shown, and what ours are compared with."""
+
+
+def tables(rows: list[dict[str, Any]]) -> list[str]:
+    """The tables in Markdown, line by line."""
+    lines = []
+    for what, (title, names, others) in TABLES.items():
+        some = [row for row in rows if row['what'] == what]
+        if not some:
+            continue
+        head = ['task', *(f'{who} [us]' for who in names), *(f'ours / {who}' for who in others)]
+        lines += [
+            f'## {title}',
+            '',
+            f'| {" | ".join(head)} |',
+            '|---|' + '---:|' * (len(head) - 1),
+        ]
+        for task in dict.fromkeys(row['task'] for row in some):
+            took = {
+                who: [
+                    1e6 * float(row['seconds']) / int(row['calls'])
+                    for row in some
+                    if (row['task'], row['name']) == (task, who)
+                ]
+                for who in names
+            }
+            cells = [spread(took[who], 1) for who in names]
+            for who in others:
+                pairs = zip(took['ours'], took[who], strict=True)
+                cells.append(spread([a / b for a, b in pairs], 2))
+            lines.append(f'| {task} | {" | ".join(cells)} |')
+        lines.append('')
+    return lines
+
+
+def spread(values: list[float], digits: int) -> str:
+    """Median [lowest, highest]."""
+    low, middle, high = min(values), statistics.median(values), max(values)
+    return f'{middle:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]'
+
+
+def write(out: Path, rows: list[dict[str, Any]], text: str) -> None:
+    """`simulator.csv`, a row for each measurement, and `simulator.md`."""
+    out.mkdir(parents=True, exist_ok=True)
+    with (out / 'simulator.csv').open('w', newline='') as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator='\n')
+        writer.writeheader()
+        writer.writerows(rows)
+    (out / 'simulator.md').write_text(text)
+
+
+def main() -> int:
+    """The command line; the exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument('--rounds', type=int, default=9)
+    parser.add_argument('--steps', type=int, default=2000, help='of a task in a round')
+    parser.add_argument('--only', default='', help='tasks whose name has this in it')
+    parser.add_argument('--clock', choices=list(CLOCKS), default='wall')
+    parser.add_argument('--out', type=Path, default=RESULTS)
+    arguments = parser.parse_args()
+    load_at_start = machine.load()
+    torch.set_num_threads(1)
+    rows = []
+    for name in NAMES:
+        if arguments.only in name:
+            print(name, file=sys.stderr, flush=True)
+            rows += step_rows(name, arguments) + action_rows(name, arguments)
+    facts = {
+        **machine.facts(load_at_start, PACKAGES),
+        'rounds': f'{arguments.rounds}, of {arguments.steps} steps and {CALLS} actions',
+        'clock': arguments.clock,
+    }
+    said = [f'- {name}: {fact}' for name, fact in facts.items()]
+    text = '\n'.join(['# The simulator', '', *tables(rows), *said]) + '\n'
+    print(text, end='')
+    write(arguments.out, rows, text)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
