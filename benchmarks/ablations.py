@@ -10,8 +10,9 @@ each, as cells of `codetr benchmark run` (resumable like any benchmark); `table`
 returns and how well step rewards were recovered at the last evaluation to
 `benchmarks/results/ablations.csv` and `.md`.
 
-Reacher-v5 with a score every 10 of its 50 steps: 8000 steps of it take half a minute, and every
-step of it has a reward of its own, so that credit matters and survival means nothing.
+Reacher-v5 with a score every 10 of its 50 steps, which is their sum or their soft maximum: 8000
+steps of it take half a minute, and every step of it has a reward of its own, so that credit
+matters and survival means nothing.
 """
 
 import argparse
@@ -26,6 +27,7 @@ from typing import Any
 import yaml
 
 TASK, DELAY, STEPS, SEEDS = 'Reacher-v5', 10, 8000, (0, 1, 2)
+COMPOSITES = ('sum', 'max')
 RESULTS = Path(__file__).parent / 'results'
 READINGS: dict[str, dict[str, Any]] = {
     'as shipped (quick)': {},
@@ -46,7 +48,7 @@ READINGS: dict[str, dict[str, Any]] = {
 }
 REFERENCES = ('none', 'uniform', 'true')
 """Methods beside which the readings are put."""
-COLUMNS = ('reading', 'seed', 'final_return', 'pearson', 'within_pearson', 'wall_s', 'commit')
+COLUMNS = ('composite', 'reading', 'seed', 'final_return', 'pearson', 'within', 'wall_s', 'commit')
 
 
 def spec(methods: list[str], changes: dict[str, Any]) -> dict[str, Any]:
@@ -54,7 +56,7 @@ def spec(methods: list[str], changes: dict[str, Any]) -> dict[str, Any]:
     return {
         'methods': methods,
         'tasks': [TASK],
-        'composites': ['sum'],
+        'composites': list(COMPOSITES),
         'delays': [DELAY],
         'seeds': list(SEEDS),
         'steps': STEPS,
@@ -96,16 +98,17 @@ def rows(out: Path) -> list[dict[str, Any]]:
             ending = json.loads((out / slug / 'cells' / f'{path.parent.name}.json').read_text())
             found.append(
                 {
+                    'composite': summary['composite'],
                     'reading': name or f'method {summary["method"]}',
                     'seed': summary['seed'],
                     'final_return': summary['evaluations'][-1]['true_return_mean'],
                     'pearson': recovered.get('pearson'),
-                    'within_pearson': recovered.get('within_pearson'),
+                    'within': recovered.get('within'),
                     'wall_s': summary['wall_s'],
                     'commit': ending.get('commit'),
                 }
             )
-    return found
+    return sorted(found, key=lambda row: COMPOSITES.index(row['composite']))
 
 
 def table(out: Path) -> None:
@@ -116,18 +119,18 @@ def table(out: Path) -> None:
         writer.writeheader()
         writer.writerows(found)
     lines = [
-        f'{TASK}, sum, delay {DELAY}, {STEPS} steps, preset quick: return of the last evaluation '
+        f'{TASK}, delay {DELAY}, {STEPS} steps, preset quick: return of the last evaluation '
         '(10 episodes), by seed, and correlation of inferred and true step rewards then.',
         '',
-        '| reading | seeds | final return | by seed | Pearson | within segments |',
-        '|---|---:|---:|---|---:|---:|',
+        '| composite | reading | seeds | final return | by seed | Pearson | within segments |',
+        '|---|---|---:|---:|---|---:|---:|',
     ]
-    for reading in dict.fromkeys(row['reading'] for row in found):
-        mine = [row for row in found if row['reading'] == reading]
+    for composite, reading in dict.fromkeys((row['composite'], row['reading']) for row in found):
+        mine = [row for row in found if (row['composite'], row['reading']) == (composite, reading)]
         returns = [row['final_return'] for row in mine]
-        cells = [reading, str(len(mine)), f'{statistics.mean(returns):.2f}']
+        cells = [composite, reading, str(len(mine)), f'{statistics.mean(returns):.2f}']
         cells.append(', '.join(f'{value:.2f}' for value in returns))
-        for column in ('pearson', 'within_pearson'):
+        for column in ('pearson', 'within'):
             values = [row[column] for row in mine if row[column] is not None]
             cells.append(f'{statistics.mean(values):.2f}' if values else '')
         lines.append(f'| {" | ".join(cells)} |')
