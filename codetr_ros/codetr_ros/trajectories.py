@@ -49,6 +49,18 @@ class SegmentBatch:
     values: F64  # (B,) the segment's composite reward; NaN for windows that only serve labelling
     true_rewards: F32 | None = None  # (B, L), where the memory holds them: the oracle only
 
+    def part(self, rows: slice) -> 'SegmentBatch':
+        """Some of the segments, in views of the same arrays."""
+        known = self.true_rewards
+        return SegmentBatch(
+            self.observations[rows],
+            self.actions[rows],
+            self.lengths[rows],
+            self.context[rows],
+            self.values[rows],
+            None if known is None else known[rows],
+        )
+
 
 class Trajectories:
     """What has been simulated, scored and labelled, bounded by a number of steps.

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim.adam import adam
 
+from codetr_ros import freed_memory
 from codetr_ros.compilation import compiled
 from codetr_ros.config import SacSettings
 from codetr_ros.learners.network import LOG_STD_RANGE
@@ -27,8 +28,6 @@ METRICS = ('critic_loss', 'actor_loss', 'temperature', 'entropy', 'q_mean')
 """What `SAC.update` says, in the order in which it is summed here."""
 DRAWN_AT_ONCE = 64
 """Updates whose steps and noise are drawn in one go; more would take memory and save no time."""
-KEPT_BYTES = 31 << 20
-"""Just below 32 MB, from where on glibc draws no conclusions from a block."""
 
 
 class FlatSAC(SAC):
@@ -46,7 +45,7 @@ class FlatSAC(SAC):
             seed: of the initial weights; torch's global generator is seeded from it.
         """
         super().__init__(observation_size, action_size, settings, seed)
-        _keep_freed_memory()
+        freed_memory.keep()
         self.batch = settings.batch
         self.critic_adam = self._critic = FlatAdam(self.critic, settings.critic_learning_rate)
         self.actor_adam = self._actor = FlatAdam(
@@ -271,13 +270,3 @@ def slopes(
         if i > 1:
             gradient = found[0] @ network[2 * i - 2].mT
     return found
-
-
-def _keep_freed_memory() -> None:
-    """Have freed memory kept for the next update, where the C library is glibc.
-
-    After the free of a block of this size it serves blocks up to it from the heap, and gives back
-    to the system only what exceeds twice of it. Otherwise each update, and each draw of a batch,
-    would take its memory anew, at the price of a page fault for every 4 KB.
-    """
-    torch.empty(KEPT_BYTES, dtype=torch.uint8)  # never written to: it takes no memory

@@ -1,5 +1,6 @@
 """CoDeTr: a reward transformer, trained to make up composite rewards from step rewards."""
 
+from collections.abc import Iterator
 from typing import ClassVar
 
 import numpy as np
@@ -53,9 +54,9 @@ class Codetr(SequenceMethod):
         self._require_prepared()
         self.network.eval()
         with torch.inference_mode():
-            weights, rewards = self.network(*self._inputs(batch))
+            parts = [self.network(*self._inputs(part)) for part in self._parts(batch)]
         outside = ~segment_steps(batch)
-        w, rhat = weights.numpy(), rewards.numpy()
+        w, rhat = (torch.cat(each).numpy() for each in zip(*parts, strict=True))
         w[outside] = 0  # with a window's scope the context has weights too
         rhat[outside] = 0
         return w, rhat
@@ -69,11 +70,16 @@ class Codetr(SequenceMethod):
     def _make_network(self, observation_size: int, action_size: int) -> RewardTransformer:
         return RewardTransformer(observation_size, action_size, self._positions, self._codetr)
 
-    def _terms(self, memory: Trajectories, rng: np.random.Generator) -> dict[str, Tensor]:
+    def _terms(
+        self, memory: Trajectories, rng: np.random.Generator
+    ) -> Iterator[dict[str, Tensor]]:
         batch = memory.sample_segments(rng, self._codetr.batch, self.context)
-        weights, rewards = self.network(*self._inputs(batch))  # (B, L) each
-        predicted = (weights * rewards * torch.from_numpy(segment_steps(batch))).sum(1)  # (B,)
-        return {'reward_loss': F.mse_loss(predicted, self._scaled(batch.values))}
+        for part in self._parts(batch):
+            weights, rewards = self.network(*self._inputs(part))  # (b, L) each
+            inside = torch.from_numpy(segment_steps(part))
+            predicted = (weights * rewards * inside).sum(1)  # (b,)
+            error = F.mse_loss(predicted, self._scaled(part.values), reduction='sum')
+            yield {'reward_loss': error / len(batch.values)}
 
     def _step_rewards(self, batch: SegmentBatch) -> Tensor:
         """With `label` 'product' those of a segment sum to its predicted composite reward."""

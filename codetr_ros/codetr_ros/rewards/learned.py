@@ -2,7 +2,7 @@
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -79,12 +79,18 @@ class Learned(RewardMethod):
         """The network, with weights drawn from torch's global generator."""
 
     @abstractmethod
-    def _terms(self, memory: Trajectories, rng: np.random.Generator) -> dict[str, Tensor]:
-        """The loss of one batch as scalars by name, whose sum is minimised."""
+    def _terms(
+        self, memory: Trajectories, rng: np.random.Generator
+    ) -> Iterator[dict[str, Tensor]]:
+        """The loss of one batch, part by part: scalars by name, whose total is minimised."""
 
     @abstractmethod
     def _step_rewards(self, batch: SegmentBatch) -> Tensor:
         """Step rewards (B, L) in units of c, of any value outside the segments."""
+
+    def _parts(self, batch: SegmentBatch) -> Sequence[SegmentBatch]:
+        """The batch in as many parts as are looked at one after the other."""
+        return [batch]
 
     def _learning_rate(self) -> float:
         """The learning rate of the next gradient step."""
@@ -117,8 +123,12 @@ class Learned(RewardMethod):
         """
         self._require_prepared()
         self.network.train()
-        terms = self._terms(memory, rng)
-        said = {name: float(term.detach()) for name, term in terms.items()}
+        self._optimiser.zero_grad()
+        said: dict[str, float] = {}
+        for terms in self._terms(memory, rng):
+            for name, term in terms.items():
+                said[name] = said.get(name, 0.0) + float(term.detach())
+            torch.stack(list(terms.values())).sum().backward()  # type: ignore[no-untyped-call]
         for name, value in said.items():
             if not math.isfinite(value):
                 raise RewardModelError(
@@ -129,8 +139,6 @@ class Learned(RewardMethod):
         rate = self._learning_rate()
         for group in self._optimiser.param_groups:
             group['lr'] = rate
-        self._optimiser.zero_grad()
-        torch.stack(list(terms.values())).sum().backward()  # type: ignore[no-untyped-call]
         self._optimiser.step()
         self.gradient_steps += 1
         return said | {'learning_rate': rate}
@@ -151,7 +159,8 @@ class Learned(RewardMethod):
         self._require_prepared()
         self.network.eval()
         with torch.inference_mode():
-            rewards: F32 = self._step_rewards(batch).numpy()
+            parts = [self._step_rewards(part).numpy() for part in self._parts(batch)]
+        rewards: F32 = np.concatenate(parts)
         rewards[~segment_steps(batch)] = 0
         return rewards
 

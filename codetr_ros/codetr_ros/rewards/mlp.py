@@ -7,7 +7,7 @@ segments, batch and number of gradient steps are CoDeTr's.
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -30,11 +30,13 @@ class Mlp(Learned):
     def _make_network(self, observation_size: int, action_size: int) -> nn.Module:
         return perceptron(observation_size + action_size, self._settings.mlp.hidden)
 
-    def _terms(self, memory: Trajectories, rng: np.random.Generator) -> dict[str, Tensor]:
+    def _terms(
+        self, memory: Trajectories, rng: np.random.Generator
+    ) -> Iterator[dict[str, Tensor]]:
         batch = memory.sample_segments(rng, self._settings.mlp.batch)
         inside = torch.from_numpy(segment_steps(batch))  # (B, L)
         predicted = (self._step_rewards(batch) * inside).sum(1)  # (B,)
-        return {'reward_loss': F.mse_loss(predicted, self._scaled(batch.values))}
+        yield {'reward_loss': F.mse_loss(predicted, self._scaled(batch.values))}
 
     def _step_rewards(self, batch: SegmentBatch) -> Tensor:
         observations = self._standardised(batch.observations[:, :-1])  # (B, L, O)

@@ -34,6 +34,7 @@ hand:
   rate of 1e-4 that rises to 1e-3 and falls again, and four times as many gradient steps.
 """
 
+from collections.abc import Iterator
 from typing import ClassVar
 
 import numpy as np
@@ -69,7 +70,9 @@ class Rbt(SequenceMethod):
     def _make_network(self, observation_size: int, action_size: int) -> 'BagTransformer':
         return BagTransformer(observation_size, action_size, self._positions, self._codetr)
 
-    def _terms(self, memory: Trajectories, rng: np.random.Generator) -> dict[str, Tensor]:
+    def _terms(
+        self, memory: Trajectories, rng: np.random.Generator
+    ) -> Iterator[dict[str, Tensor]]:
         """`reward_loss` of the sums, and `state_loss` of next observations times its weight."""
         ids = memory.segment_ids()
         last = ids[rng.integers(0, len(ids), -(-self._codetr.batch // self._segments))]
@@ -86,7 +89,7 @@ class Rbt(SequenceMethod):
         each = rewards.view(len(windows), -1, batch.actions.shape[1])[row, place]  # (S, n)
         sums = each.sum(1)  # (S,)
         state_loss = (predicted - following)[inside].square().mean()
-        return {
+        yield {
             'reward_loss': (sums - self._scaled(batch.values)).square().mean(),
             'state_loss': self._settings.rbt.state_loss_weight * state_loss,
         }

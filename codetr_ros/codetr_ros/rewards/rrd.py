@@ -26,6 +26,7 @@ subsequences of K = 64 steps, and draws trajectories in proportion to their leng
 its Xavier weights are uniform, as here, is inferred; the paper itself was not at hand.
 """
 
+from collections.abc import Iterator
 from typing import ClassVar
 
 import numpy as np
@@ -55,7 +56,9 @@ class Rrd(Learned):
     def _make_network(self, observation_size: int, action_size: int) -> nn.Module:
         return perceptron(2 * observation_size + action_size, self._settings.rrd.hidden)
 
-    def _terms(self, memory: Trajectories, rng: np.random.Generator) -> dict[str, Tensor]:
+    def _terms(
+        self, memory: Trajectories, rng: np.random.Generator
+    ) -> Iterator[dict[str, Tensor]]:
         rrd = self._settings.rrd
         drawn = draw_by_length(memory, rng, rrd.subsequences)
         batch = memory.segment_batch(drawn)
@@ -63,7 +66,7 @@ class Rrd(Learned):
         rewards = self._rewards_at(batch, steps)
         returns = self._scaled(batch.values / batch.lengths)
         lengths = torch.from_numpy(batch.lengths)
-        return {
+        yield {
             'reward_loss': decomposition_loss(rewards, returns, lengths, rrd.loss == 'unbiased')
         }
 

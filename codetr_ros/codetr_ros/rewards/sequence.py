@@ -9,11 +9,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from codetr_ros import freed_memory
 from codetr_ros.config import CodetrSettings, Settings
 from codetr_ros.records import F32
 from codetr_ros.rewards.learned import Learned
 from codetr_ros.rewards.method import RewardModelError, segment_steps
 from codetr_ros.trajectories import SegmentBatch, Trajectories
+
+PART_BYTES = 16 << 20
+"""Upper bound of one window's or several windows' activations of one kind, where more than one
+window is looked at: half of what the C library serves from memory that it has (`freed_memory`).
+"""
 
 
 class SequenceMethod(Learned):
@@ -42,6 +48,7 @@ class SequenceMethod(Learned):
         self.label_batch = settings.codetr.label_batch
         self._whole_window = whole_window
         self._positions = max(settings.delay + context, settings.codetr.window)
+        freed_memory.keep()
         super().__init__(settings, observation_size, action_size)
 
     def label_passes(self, memory: Trajectories, ids: NDArray[np.int64]) -> Iterator[F32]:
@@ -56,6 +63,18 @@ class SequenceMethod(Learned):
         """Step rewards (B,) of the last step of each window."""
         labels = self.label(batch)
         return labels[np.arange(len(labels)), batch.lengths - 1]
+
+    def _parts(self, batch: SegmentBatch) -> list[SegmentBatch]:
+        """The batch in parts of equal size, none of which makes larger arrays than `PART_BYTES`.
+
+        They stay in the processor's cache, and their memory is used again.
+        """
+        windows, steps = batch.actions.shape[:2]
+        tokens = steps * (2 if self._codetr.tokens == 'pair' else 1)
+        widest = max(4 * self._codetr.embedding, self._codetr.heads * tokens) * tokens * 4
+        count = -(-windows // max(1, PART_BYTES // widest))
+        size = -(-windows // count)
+        return [batch.part(slice(i, i + size)) for i in range(0, windows, size)]
 
     def _learning_rate(self) -> float:
         return learning_rate(self._codetr, self.gradient_steps)

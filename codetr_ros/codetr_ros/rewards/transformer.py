@@ -18,10 +18,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from codetr_ros.config import CodetrSettings
+from codetr_ros.rewards.dropout import add_dropped, keep_mask
 
 
 class CausalSelfAttention(nn.Module):
-    """Multi-head attention of each token to itself and those before it."""
+    """Multi-head attention of tokens to themselves and those before them."""
 
     def __init__(self, settings: CodetrSettings) -> None:
         super().__init__()
@@ -31,15 +32,47 @@ class CausalSelfAttention(nn.Module):
         self.qkv = nn.Linear(d, 3 * d)
         self.out = nn.Linear(d, d)
 
-    def forward(self, h: Tensor) -> Tensor:
-        """Tokens (B, N, d) to what they attend to, mixed (B, N, d)."""
+    def forward(self, h: Tensor, every: int = 1) -> Tensor:
+        """Tokens (B, N, d) to what each `every`-th of them attends to, mixed (B, N/every, d)."""
         b, n, d = h.shape
-        qkv = self.qkv(h).view(b, n, 3, self.heads, d // self.heads)  # (B, N, 3, H, d/H)
-        q, k, v = qkv.permute(2, 0, 3, 1, 4)  # each (B, H, N, d/H)
-        p = self.dropout if self.training else 0.0
-        y = F.scaled_dot_product_attention(q, k, v, dropout_p=p, is_causal=True)  # (B, H, N, d/H)
-        mixed: Tensor = self.out(y.transpose(1, 2).reshape(b, n, d))  # (B, N, d)
+        size = d // self.heads
+        if every == 1:
+            q, k, v = self.qkv(h).view(b, n, 3, self.heads, size).permute(2, 0, 3, 1, 4)
+        else:
+            weight, bias = self.qkv.weight, self.qkv.bias
+            asking = F.linear(h[:, every - 1 :: every], weight[:d], bias[:d])  # (B, N/every, d)
+            q = asking.view(b, -1, self.heads, size).transpose(1, 2)
+            k, v = (
+                F.linear(h, weight[d:], bias[d:])
+                .view(b, n, 2, self.heads, size)
+                .permute(2, 0, 3, 1, 4)
+            )
+        y = causal_attention(q, k, v, self.dropout if self.training else 0.0)  # (B, H, N', d/H)
+        mixed: Tensor = self.out(y.transpose(1, 2).reshape(b, -1, d))
         return mixed
+
+
+def causal_attention(q: Tensor, k: Tensor, v: Tensor, dropout: float) -> Tensor:
+    """Attention of queries (B, H, Q, c) to keys and values (B, H, N, c), N a multiple of Q.
+
+    Query i belongs to the last token of the i-th of Q equal parts, and sees those up to there.
+    With dropout it is written out: torch's own takes several times as long on a CPU.
+
+    Returns:
+        (B, H, Q, c).
+    """
+    asking, tokens = q.shape[2], k.shape[2]
+    if not dropout and asking == tokens:
+        return F.scaled_dot_product_attention(q, k, v, is_causal=True)
+    last = torch.arange(1, asking + 1)[:, None] * (tokens // asking) - 1  # (Q, 1)
+    unseen = torch.zeros(asking, tokens).masked_fill_(torch.arange(tokens) > last, -math.inf)
+    if not dropout:
+        return F.scaled_dot_product_attention(q, k, v, attn_mask=unseen)
+    scale = 1 / math.sqrt(q.shape[3])
+    logits = torch.baddbmm(unseen, q.flatten(0, 1), k.flatten(0, 1).mT, alpha=scale)
+    attention = logits.softmax(-1)  # (B H, Q, N)
+    attention = attention * keep_mask(attention.shape, dropout)
+    return (attention @ v.flatten(0, 1)).view(q.shape)
 
 
 class Block(nn.Module):
@@ -53,21 +86,23 @@ class Block(nn.Module):
         self.norm2 = nn.LayerNorm(d)
         self.widen = nn.Linear(d, 4 * d)
         self.narrow = nn.Linear(4 * d, d)
-        self.dropout = nn.Dropout(settings.dropout)
+        self.dropout = settings.dropout
 
-    def forward(self, h: Tensor) -> Tensor:
-        """Tokens (B, N, d) to tokens of the next layer (B, N, d)."""
-        h = h + self.dropout(self.attention(self.norm1(h)))  # (B, N, d)
-        wide = F.relu(self.widen(self.norm2(h)))  # (B, N, 4d)
-        mixed: Tensor = h + self.dropout(self.narrow(wide))  # (B, N, d)
-        return mixed
+    def forward(self, h: Tensor, every: int = 1) -> Tensor:
+        """Tokens (B, N, d) to each `every`-th one of the next layer (B, N/every, d)."""
+        dropout = self.dropout if self.training else 0.0
+        mixed = self.attention(self.norm1(h), every)  # (B, N/every, d)
+        h = add_dropped(h[:, every - 1 :: every], mixed, dropout)
+        wide = self.widen(self.norm2(h)).relu_()  # (B, N/every, 4d)
+        return add_dropped(h, self.narrow(wide), dropout)
 
 
 class CausalTransformer(nn.Module):
     """Steps to their causal states: x_t has seen what happened up to step t, nothing after it.
 
     Tokens are `pair` (s_1, a_1, s_2, a_2, ...), read at the action, or `merged`, one for each
-    step. A step's position is its place in the window, whatever its time in the episode.
+    step. What is not read is left out of the last layer, where nothing depends on it. A step's
+    position is its place in the window, whatever its time in the episode.
     """
 
     def __init__(
@@ -80,8 +115,8 @@ class CausalTransformer(nn.Module):
         self.action = nn.Linear(action_size, d)
         self.position = nn.Embedding(positions, d)
         self.norm_in = nn.LayerNorm(d)
-        self.dropout = nn.Dropout(settings.dropout)
-        self.blocks = nn.Sequential(*(Block(settings) for _ in range(settings.layers)))
+        self.dropout = settings.dropout
+        self.blocks = nn.ModuleList(Block(settings) for _ in range(settings.layers))
         self.norm_out = nn.LayerNorm(d)
 
     def forward(self, observations: Tensor, actions: Tensor) -> Tensor:
@@ -93,8 +128,13 @@ class CausalTransformer(nn.Module):
             tokens = torch.stack([s + position, a + position], 2).flatten(1, 2)  # (B, 2L, d)
         else:
             tokens = s + a + position  # (B, L, d)
-        h = self.blocks(self.dropout(self.norm_in(tokens)))  # (B, N, d)
-        x: Tensor = self.norm_out(h[:, 1::2] if self.pair else h)  # (B, L, d)
+        h = self.norm_in(tokens)  # (B, N, d)
+        if self.training and self.dropout:
+            h = h * keep_mask(h.shape, self.dropout)
+        *others, last = self.blocks
+        for block in others:
+            h = block(h)
+        x: Tensor = self.norm_out(last(h, 2 if self.pair else 1))  # (B, L, d)
         return x
 
 

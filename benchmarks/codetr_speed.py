@@ -1,0 +1,205 @@
+"""How fast does CoDeTr learn and label, and how fast could it be?
+
+    .venv/bin/python benchmarks/codetr_speed.py                       # on an idle machine
+    .venv/bin/python benchmarks/codetr_speed.py --delays 25 100 --threads 1 --rounds 3
+
+Measured, at the size that the preset `paper` gives the reward transformer, on steps of Ant (27
+observations, 8 actions), for each delay n:
+  - gradient: one gradient step as the reward node takes it, batch drawn from the memory
+  - label: whole segments of the memory labelled as the reward node labels them
+
+Each is set against its floor: the floating point operations that it needs
+(`codetr_ros.rewards.cost`), at the rate that products of float32 matrices reach in the same round.
+That rate is the higher one of two shapes: 256x256 by 256x256, and the tokens of 64 segments of 25
+steps by the MLP's weights. A ratio of 1 is as fast as the products alone. Rounds go through
+everything in turn; the table gives the median round, and the lowest and highest in brackets.
+
+`--clock cpu` counts the time that the processor worked instead of the time on the wall: for one
+thread on a machine that does other things as well.
+"""
+
+import argparse
+import csv
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import machine
+from codetr_ros.config import Settings, load
+from codetr_ros.records import CompositeReward, Transitions
+from codetr_ros.rewards.codetr import Codetr
+from codetr_ros.rewards.cost import Cost
+from codetr_ros.seeding import generator, seed_torch
+from codetr_ros.trajectories import Trajectories
+
+RESULTS = Path(__file__).parent / 'results' / 'codetr_speed'
+OBSERVATION, ACTION = 27, 8  # Ant
+DELAYS = (5, 25, 50, 100, 200, 500)
+EPISODE, EPISODES = 1000, 64
+LABELLED = 6400  # steps, or 64 segments where these are more
+
+
+def memory(delay: int) -> Trajectories:
+    """Scored episodes of random steps."""
+    found = Trajectories(OBSERVATION, ACTION, delay, EPISODE * EPISODES, EPISODE)
+    rng = np.random.default_rng(0)
+    for n in range(EPISODES):
+        observations = rng.standard_normal((EPISODE + 1, OBSERVATION), np.float32)
+        actions = rng.uniform(-1, 1, (EPISODE, ACTION)).astype(np.float32)
+        head = ('run', 'sim', n, n, n, 0, EPISODE)
+        found.append(Transitions(*head, observations, actions, False, True, True, 1))
+        for first in range(0, EPISODE, delay):
+            value = float(rng.standard_normal())
+            found.score(CompositeReward('run', 'sim', 'sim', first, n, first, delay, value))
+    return found
+
+
+class Work:
+    """What is measured for one delay."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.memory = memory(settings.delay)
+        self.model = Codetr(settings, OBSERVATION, ACTION)
+        self.model.prepare(self.memory)
+        segments = max(LABELLED // settings.delay, 64)
+        self.ids = self.memory.segment_ids()[:segments]
+        self.steps = 0
+
+    def gradient(self) -> int:
+        """One gradient step; the operations it needs."""
+        seed_torch(0, 'reward', self.steps)
+        self.model.gradient_step(self.memory, generator(0, 'reward', self.steps))
+        self.steps += 1
+        return self._cost(self.settings.codetr.batch).gradient
+
+    def label(self) -> int:
+        """Label some segments; the operations that it needs."""
+        for i in range(0, len(self.ids), self.model.label_batch):
+            some = self.ids[i : i + self.model.label_batch]
+            for _ in self.model.label_passes(self.memory, some):
+                pass
+        return self._cost(len(self.ids)).forward
+
+    def _cost(self, segments: int) -> Cost:
+        settings = self.settings
+        return Cost(settings.codetr, OBSERVATION, ACTION, segments, settings.delay)
+
+
+def sgemm() -> float:
+    """Operations per second of products of float32 matrices."""
+    best = 0.0
+    for rows, inner, columns in ((256, 256, 256), (64 * 50, 256, 1024)):
+        a, b = torch.randn(rows, inner), torch.randn(inner, columns)
+        out = torch.empty(rows, columns)
+        flops = 2 * rows * inner * columns
+        times = max(1, round(5e9 / flops))
+        torch.mm(a, b, out=out)
+        began = CLOCKS[clock]()
+        for _ in range(times):
+            torch.mm(a, b, out=out)
+        best = max(best, times * flops / (CLOCKS[clock]() - began))
+    return best
+
+
+CLOCKS: dict[str, Callable[[], float]] = {'wall': time.perf_counter, 'cpu': time.process_time}
+clock = 'wall'
+
+
+def measure(delay: int, threads: int, rounds: int) -> list[dict[str, Any]]:
+    """All rounds of one delay and number of threads."""
+    torch.set_num_threads(threads)
+    work = Work(load('paper').changed({'delay': delay, 'threads': threads}))
+    tasks: dict[str, tuple[Callable[[], int], int]] = {
+        'gradient': (work.gradient, 1),
+        'label': (work.label, len(work.ids) * delay),
+    }
+    for task, _ in tasks.values():
+        task()  # does not count
+    rows = []
+    for n in range(rounds):
+        for name, (task, units) in tasks.items():
+            before = sgemm()
+            began = CLOCKS[clock]()
+            flops = task()
+            seconds = CLOCKS[clock]() - began
+            floor = (before + sgemm()) / 2  # a virtual machine's speed changes within seconds
+            rows.append(
+                {'delay': delay, 'threads': threads, 'what': name, 'round': n}
+                | {'seconds': round(seconds, 5), 'units': units, 'flops': flops}
+                | {'sgemm_gflops': round(floor / 1e9, 2)}
+                | {'ratio': round(flops / seconds / floor, 4)}
+            )
+    print(line(rows), flush=True)
+    return rows
+
+
+HEAD = (
+    '| n | threads | sgemm [GFLOP/s] | gradient steps/s | of the floor '
+    '| labelled steps/s | of the floor |\n|---|---|---|---|---|---|---|'
+)
+
+
+def line(rows: list[dict[str, Any]]) -> str:
+    """The table's line for one delay and number of threads."""
+    cells = [f'{rows[0]["delay"]}', f'{rows[0]["threads"]}']
+    cells.append(f'{statistics.median(row["sgemm_gflops"] for row in rows):.0f}')
+    for what in ('gradient', 'label'):
+        mine = [row for row in rows if row['what'] == what]
+        rate = statistics.median(row['units'] / row['seconds'] for row in mine)
+        ratios = [row['ratio'] for row in mine]
+        cells.append(f'{rate:.2f}' if what == 'gradient' else f'{rate:.0f}')
+        cells.append(f'{statistics.median(ratios):.2f} [{min(ratios):.2f}, {max(ratios):.2f}]')
+    return f'| {" | ".join(cells)} |'
+
+
+def write(rows: list[dict[str, Any]], out: Path, facts: dict[str, str]) -> None:
+    """The CSV file of all rounds, and the table."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with out.with_suffix('.csv').open('w', newline='') as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    sizes = dict.fromkeys((row['delay'], row['threads']) for row in rows)
+    text = ['# Gradient steps and labels of CoDeTr per second', '']
+    text += [f'- {name}: {value}' for name, value in facts.items()]
+    text += ['', 'Median round [lowest, highest]. What is measured: `benchmarks/codetr_speed.py`.']
+    text += ['', HEAD]
+    text += [
+        line([row for row in rows if (row['delay'], row['threads']) == size]) for size in sizes
+    ]
+    out.with_suffix('.md').write_text('\n'.join(text) + '\n')
+
+
+def main() -> None:
+    """The command line."""
+    global clock  # noqa: PLW0603
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument('--delays', type=int, nargs='+', default=DELAYS)
+    parser.add_argument('--threads', type=int, nargs='+', default=[1, 2])
+    parser.add_argument('--rounds', type=int, default=7)
+    parser.add_argument('--clock', choices=list(CLOCKS), default='wall')
+    parser.add_argument('--out', type=Path, default=RESULTS, help='without its suffix')
+    arguments = parser.parse_args()
+    clock = arguments.clock
+    load_before = machine.load()
+    print(HEAD, flush=True)
+    rows = []
+    for threads in arguments.threads:
+        for delay in arguments.delays:
+            rows += measure(delay, threads, arguments.rounds)
+    facts = machine.facts(load_before, ('torch', 'numpy'))
+    facts |= {'clock': clock, 'rounds': str(arguments.rounds), 'command': ' '.join(sys.argv)}
+    write(rows, arguments.out, facts)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,82 @@
+"""What the reward transformer costs: the floating point operations of its matrix products.
+
+Two operations for each multiplication, as everybody counts them. Counted is what the algorithm
+needs and nothing else: attention to the tokens that a token may see, and in the last layer the
+tokens only that are read. The rest (softmax, norms, dropout) is linear in the activations and left
+out: at the rate of matrix products this is the least time that a pass can take, its floor.
+"""
+
+from dataclasses import dataclass
+
+from codetr_ros.config import CodetrSettings
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Floating point operations of one batch of windows.
+
+    Args:
+        settings: the architecture.
+        observation_size: O.
+        action_size: A.
+        windows: B.
+        steps: L, of each window.
+    """
+
+    settings: CodetrSettings
+    observation_size: int
+    action_size: int
+    windows: int
+    steps: int
+
+    @property
+    def forward(self) -> int:
+        """Of labelling the windows."""
+        return self._inputs + self._products
+
+    @property
+    def gradient(self) -> int:
+        """Of a gradient step: a product forward is two backward, but nobody asks for the gradients
+        of observations and actions.
+        """
+        return 2 * self._inputs + 3 * self._products
+
+    @property
+    def unseen(self) -> int:
+        """Of a forward pass that multiplies with all tokens and masks those that are not seen: so
+        many more.
+        """
+        tokens, read = self._tokens
+        every = (self.settings.layers - 1) * tokens**2 + read * tokens
+        return 4 * self.windows * self.settings.embedding * (every - self._seen)
+
+    @property
+    def _tokens(self) -> tuple[int, int]:
+        """Tokens of a window, and how many of them are read at the end: one for each step."""
+        return self.steps * (2 if self.settings.tokens == 'pair' else 1), self.steps
+
+    @property
+    def _seen(self) -> int:
+        """Pairs of a token and one that it sees, in all layers of one window."""
+        tokens, read = self._tokens
+        triangle = tokens * (tokens + 1) // 2
+        last = read * (read + 1) if self.settings.tokens == 'pair' else triangle
+        return (self.settings.layers - 1) * triangle + last
+
+    @property
+    def _inputs(self) -> int:
+        rows = self.windows * self.steps
+        return 2 * rows * (self.observation_size + self.action_size) * self.settings.embedding
+
+    @property
+    def _products(self) -> int:
+        d, layers = self.settings.embedding, self.settings.layers
+        tokens, read = self._tokens
+        # of width d to d: key and value of each token; query, output and MLP of those needed
+        squares = layers * 2 * tokens + 10 * ((layers - 1) * tokens + read)
+        attention = 2 * d * self._seen
+        head = read * d  # the reward
+        if self.settings.weights == 'attention':
+            squares += 2 * read
+            head += read**2 * d
+        return 2 * self.windows * (squares * d**2 + attention + head)
