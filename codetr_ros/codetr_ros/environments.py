@@ -96,7 +96,8 @@ class Environment(ABC):
                 announced.
         """
         self._steps = 0
-        observation = self._checked(self._reset(seed))
+        observation = self._reset(seed)
+        self._check(observation)
         if len(observation) != self.observation_size:
             raise TaskError(
                 f'task {self.name!r}, reset: {len(observation)} observations, '
@@ -119,17 +120,17 @@ class Environment(ABC):
             if self._scaled
             else action
         )
-        raw, reward, terminated = self._step(scaled)
+        observation, reward, terminated = self._step(scaled)
         if not math.isfinite(reward):
             raise TaskError(self._not_finite('reward', reward))
-        return self._checked(raw), reward, terminated
+        self._check(observation)
+        return observation, reward, terminated
 
-    def _checked(self, raw: NDArray[Any]) -> F32:
-        observation = np.array(raw, np.float32).reshape(-1)  # a copy: environments reuse arrays
-        if not np.isfinite(observation).all():
-            i = int(np.argmin(np.isfinite(observation)))
+    def _check(self, observation: F32) -> None:
+        finite = np.isfinite(observation)
+        if 0 in finite.tobytes():  # a third of the time that `all` takes
+            i = int(np.argmin(finite))
             raise TaskError(self._not_finite(f'observation[{i}]', observation[i]))
-        return observation
 
     def _not_finite(self, field: str, value: float) -> str:
         return (
@@ -138,10 +139,12 @@ class Environment(ABC):
         )
 
     @abstractmethod
-    def _reset(self, seed: int) -> NDArray[Any]: ...
+    def _reset(self, seed: int) -> F32:
+        """An observation that is the caller's own."""
 
     @abstractmethod
-    def _step(self, action: NDArray[Any]) -> tuple[NDArray[Any], float, bool]: ...
+    def _step(self, action: NDArray[Any]) -> tuple[F32, float, bool]:
+        """The same, with reward and termination, after an action within the bounds."""
 
     @abstractmethod
     def close(self) -> None:
@@ -153,6 +156,8 @@ class GymnasiumEnvironment(Environment):
 
     def __init__(self, task: Task) -> None:
         import gymnasium
+
+        from codetr_ros.gymnasium_steps import stepper
 
         try:
             with _quiet():
@@ -180,19 +185,21 @@ class GymnasiumEnvironment(Environment):
         size = math.prod(spaces['observation'].shape)
         super().__init__(task, size, box.low, box.high, _period(self._env))
         self._scaled = self._scaled or box.low.ndim != 1
+        self._stepper = stepper(self._env)
 
-    def _reset(self, seed: int) -> NDArray[Any]:
-        observation: NDArray[Any] = self._env.reset(seed=seed)[0]
-        return observation
+    def _reset(self, seed: int) -> F32:
+        return _own(self._env.reset(seed=seed)[0])
 
-    def _step(self, action: NDArray[Any]) -> tuple[NDArray[Any], float, bool]:
+    def _step(self, action: NDArray[Any]) -> tuple[F32, float, bool]:
+        if self._stepper is not None:
+            return self._stepper.step(action)
         observation, reward, terminated, truncated, _ = self._env.step(action)
         if truncated and self._steps < self.horizon:
             raise TaskError(
                 f'task {self.name!r} truncated an episode itself, at step {self._steps} of '
                 f'horizon={self.horizon}: register it with max_episode_steps={self._steps}'
             )
-        return observation, float(reward), bool(terminated)
+        return _own(observation), float(reward), bool(terminated)
 
     def close(self) -> None:
         """Free what the environment holds."""
@@ -222,13 +229,12 @@ class ControlSuiteEnvironment(Environment):
         size = math.prod(self._env.observation_spec()['observations'].shape)
         super().__init__(task, size, box.minimum, box.maximum, float(self._env.control_timestep()))
 
-    def _reset(self, seed: int) -> NDArray[Any]:
+    def _reset(self, seed: int) -> F32:
         # all that a task of the suite draws comes from this generator
         self._env.task.random.seed(seed)
-        observation: NDArray[Any] = self._env.reset().observation['observations']
-        return observation
+        return _own(self._env.reset().observation['observations'])
 
-    def _step(self, action: NDArray[Any]) -> tuple[NDArray[Any], float, bool]:
+    def _step(self, action: NDArray[Any]) -> tuple[F32, float, bool]:
         from dm_control.rl.control import PhysicsError
 
         try:
@@ -238,7 +244,7 @@ class ControlSuiteEnvironment(Environment):
                 f'task {self.name!r}, step {self._steps} of the episode: {error}'
             ) from error
         return (
-            step.observation['observations'],
+            _own(step.observation['observations']),
             float(step.reward),
             False,
         )  # these tasks have no terminal states
@@ -246,6 +252,11 @@ class ControlSuiteEnvironment(Environment):
     def close(self) -> None:
         """Free what the environment holds."""
         self._env.close()
+
+
+def _own(raw: NDArray[Any]) -> F32:
+    """A copy in one dimension: environments reuse their arrays."""
+    return np.array(raw, np.float32).reshape(-1)
 
 
 def _period(env: Any) -> float:
