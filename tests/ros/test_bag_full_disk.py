@@ -1,5 +1,10 @@
 """The disk runs full while a bag is written: the error says so, nothing flushed is lost."""
 
+import errno
+import os
+import resource
+import shutil
+
 import pytest
 from disks import fill, small_disk
 from mcap.reader import make_reader
@@ -98,3 +103,43 @@ def test_a_bag_whose_metadata_cannot_be_written_says_that_it_is_whole(tmp_path):
         writer.close()
     with (tmp_path / 'bag' / 'bag_0.mcap').open('rb') as file:
         assert len(list(make_reader(file).iter_messages())) == 3
+
+
+def read_only(path, monkeypatch):
+    def refused(*_):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(os, 'truncate', refused)
+    return 'Read-only file system'
+
+
+def gone(path, monkeypatch):
+    path.unlink()
+    return 'No such file or directory'
+
+
+@pytest.mark.parametrize('happened', [read_only, gone])
+def test_a_file_that_cannot_be_cut_back_is_said_in_the_same_error(tmp_path, monkeypatch, happened):
+    writer = McapWriter(tmp_path / 'bag', [TRANSITIONS])
+    write(writer, 30)
+    writer.flush()
+    flushed = writer.size
+    reason = happened(tmp_path / 'bag' / 'bag_0.mcap', monkeypatch)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (flushed, limits[1]))
+    try:
+        with pytest.raises(BagError, match='bag_0.mcap cannot be written: File too large') as e:
+            at_a_flush(writer)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert f'It holds the {flushed} bytes flushed before' in str(e.value)
+    assert f'not cut back to them ({reason})' in str(e.value)
+    assert 'codetr bag recover' in str(e.value)
+    writer.close()  # harmless
+
+
+def test_a_disk_that_does_not_say_how_full_it_is_is_named(tmp_path):
+    writer = McapWriter(tmp_path / 'bag', [TRANSITIONS], keep_free=1)
+    shutil.rmtree(tmp_path / 'bag')
+    with pytest.raises(BagError, match='bag: its disk does not say what room is left: No such'):
+        writer.check_room()

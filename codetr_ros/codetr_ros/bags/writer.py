@@ -179,7 +179,13 @@ class McapWriter:
         Raises:
             BagError: the disk has less room left than was to be kept. The bag is as it was.
         """
-        free = shutil.disk_usage(self.folder).free
+        try:
+            free = shutil.disk_usage(self.folder).free
+        except OSError as error:
+            raise BagError(
+                f'bag {self.folder}: its disk does not say what room is left: {error.strerror}. '
+                'Mend it, and start the run again in another folder'
+            ) from error
         if free < self._keep_free:
             raise BagError(
                 f'bag {self.folder}: the disk has {free / 1e6:.1f} MB left, fewer than the '
@@ -206,13 +212,17 @@ class McapWriter:
             OSError
         ):  # closing tries to write the buffer once more; the file is closed all the same
             self._stream.close()
-        if self._path is not None and self._good:
-            os.truncate(self._path, self._good)
-        elif self._path is not None:  # not even its beginning is on the disk
-            self._path.unlink()
+        left = 'the last file without an index'
+        try:
+            if self._path is not None and self._good:
+                os.truncate(self._path, self._good)
+            elif self._path is not None:  # not even its beginning is on the disk
+                self._path.unlink()
+        except OSError as failed:
+            left += f' and not cut back to them ({failed.strerror}): half a chunk may follow'
         return BagError(
             f'bag {self._path or self.folder} cannot be written: {error.strerror}. It holds the '
-            f'{self.size} bytes flushed before, the last file without an index: make room, '
+            f'{self.size} bytes flushed before, {left}. Make room, or mend the disk: '
             f'`codetr bag recover {self.folder} --out NEW` makes it whole; start the run again in '
             f'another folder'
         )

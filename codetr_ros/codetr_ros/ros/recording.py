@@ -9,16 +9,15 @@ again.
 """
 
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
 
 from codetr_ros import run_folder
+from codetr_ros.bags.first_labels import FirstLabels
 from codetr_ros.bags.topics import BagTopic
 from codetr_ros.bags.writer import McapWriter
 from codetr_ros.config import Settings
@@ -40,39 +39,8 @@ from codetr_ros.ros.signals import Stop
 
 NOT_RECORDED = (Presence,)
 """Says who is alive, once a second: nothing of the run itself."""
-
-
-class FirstLabels:
-    """What of the step rewards goes into the bag when it keeps first labels only.
-
-    Every part is kept, so that the bag has as many as were published; a part holds the segments
-    labelled for the first time, or all of them where the phase's policy is evaluated.
-    """
-
-    def __init__(self, settings: Settings) -> None:
-        self._settings = settings
-        self._seen: set[tuple[str, int, int]] = set()
-
-    def keep(self, part: StepRewards) -> StepRewards | None:
-        """The part reduced to what is kept; None if all of it is."""
-        keys = [
-            (part.source, episode, first)
-            for episode, first in zip(
-                part.episodes.tolist(), part.first_steps.tolist(), strict=True
-            )
-        ]
-        fresh = np.array([key not in self._seen for key in keys], bool)
-        self._seen.update(keys)
-        if fresh.all() or self._settings.evaluated(part.phase):
-            return None
-        return replace(
-            part,
-            source=part.source if fresh.any() else '',
-            episodes=part.episodes[fresh],
-            first_steps=part.first_steps[fresh],
-            lengths=part.lengths[fresh],
-            labels=part.labels[np.repeat(fresh, part.lengths)],
-        )
+FLUSHES = 1000
+"""Flushes of which the report gives the median: the newest."""
 
 
 class RecordNode(CoreNode):
@@ -87,7 +55,8 @@ class RecordNode(CoreNode):
         self._full: dict[type, str] = {}
         self._recorded: Counter[str] = Counter()
         self._missed: dict[str, int] = {}
-        self._flush_seconds: list[float] = []
+        self._flush_seconds = self._longest_flush = 0.0
+        self._flushes: deque[float] = deque(maxlen=FLUSHES)  # seconds, the newest
 
     def open_topics(self, settings: Settings) -> None:
         """Open the bag, then subscribe to everything as raw bytes."""
@@ -177,7 +146,10 @@ class RecordNode(CoreNode):
         if self._bag is not None:
             began = time.perf_counter()
             self._bag.flush()
-            self._flush_seconds.append(time.perf_counter() - began)
+            seconds = time.perf_counter() - began
+            self._flushes.append(seconds)
+            self._flush_seconds += seconds
+            self._longest_flush = max(self._longest_flush, seconds)
         self._last.commit(record, raw)
         self.link.send(TOPICS[Commit], message)
 
@@ -224,11 +196,11 @@ class RecordNode(CoreNode):
 
     def own_report(self) -> dict[str, Any]:
         """What was recorded, and where."""
-        flushes = sorted(self._flush_seconds) or [0.0]
+        median = 1e3 * sorted(self._flushes)[len(self._flushes) // 2] if self._flushes else 0.0
         return {
             'recorded': dict(self._recorded),
             'bag': str(self._bag.folder) if self._bag else None,
             'bag_bytes': self._bag.size if self._bag else 0,
-            'flush_seconds': sum(self._flush_seconds),
-            'flush_ms': {'median': 1e3 * flushes[len(flushes) // 2], 'max': 1e3 * flushes[-1]},
+            'flush_seconds': self._flush_seconds,
+            'flush_ms': {'median': median, 'max': 1e3 * self._longest_flush},
         }
