@@ -1,11 +1,13 @@
 import json
+import math
+from dataclasses import replace
 
 import pytest
 from bags.making import WRITERS, a_run, ours
 
-from codetr_ros.bags.info import survey
+from codetr_ros.bags.info import Range, survey
 from codetr_ros.cli import main
-from codetr_ros.records import CompositeReward
+from codetr_ros.records import CompositeReward, RunSpec
 
 
 @pytest.mark.parametrize('writer', ['ours', 'rosbags-sqlite-9', 'mcap-lz4'])
@@ -58,3 +60,36 @@ def test_what_is_no_bag_is_refused(tmp_path, capsys):
     assert 'holds no file of .mcap or .db3' in capsys.readouterr().err
     assert main(['bag', 'turn']) == 2
     assert "no command bag 'turn'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('wrong', [math.nan, math.inf, -math.inf])
+def test_numbers_that_are_not_finite_are_counted_and_the_json_is_json(wrong, tmp_path, capsys):
+    records = a_run()
+    at = next(i for i, r in enumerate(records) if isinstance(r, CompositeReward))
+    records[at] = replace(records[at], value=wrong)
+    settings = '{"delay": NaN, "steps": [1e999], "seed": 3}'
+    records = [replace(r, settings=settings) if isinstance(r, RunSpec) else r for r in records]
+    bag = ours(tmp_path / 'bag', records)
+    assert main(['bag', 'info', str(bag), '--json']) == 0
+
+    def refuse(word):
+        raise AssertionError(f'{word} is not JSON')
+
+    (run,) = json.loads(capsys.readouterr().out, parse_constant=refuse)['runs']
+    values = [r.value for r in records if isinstance(r, CompositeReward)]
+    values = [value for value in values if math.isfinite(value)]
+    assert run['scores'] == {
+        'count': 11, 'min': min(values), 'max': max(values), 'not_finite': 1,
+        'mean': pytest.approx(sum(values) / 11),
+    }  # fmt: skip
+    assert run['segments_scored'] == 12
+    assert run['settings'] == {'delay': 'nan', 'steps': '[inf]', 'seed': 3}
+    assert main(['bag', 'info', str(bag)]) == 0
+    assert '1 not finite' in capsys.readouterr().out
+
+
+def test_the_mean_of_the_largest_numbers_is_a_number():
+    found = Range()
+    for value in (1.7e308, 1.7e308, -1.0, 1.7e308):
+        found.add(value)
+    assert found.report()['mean'] == pytest.approx(1.275e308)

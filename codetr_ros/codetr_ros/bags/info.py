@@ -1,6 +1,7 @@
 """What is in a bag, counted in one pass."""
 
 import json
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,30 +21,35 @@ from codetr_ros.records import (
 
 SETTINGS = ('task', 'composite', 'delay', 'method', 'steps', 'seed', 'simulators')
 """The settings that are shown."""
+_SMALL = 2.0**-64  # a sum of numbers so much smaller cannot overflow, and is as exact
 
 
 @dataclass
 class Range:
-    """Count, lowest, highest and mean of numbers."""
+    """Count, lowest, highest and mean of numbers. Those that are not finite are only counted."""
 
     count: int = 0
+    not_finite: int = 0
     low: float = float('inf')
     high: float = float('-inf')
-    total: float = 0.0
+    total: float = 0.0  # times `_SMALL`
 
     def add(self, value: float) -> None:
         """Take a number in."""
+        if not math.isfinite(value):
+            self.not_finite += 1
+            return
         self.count += 1
         self.low = min(self.low, value)
         self.high = max(self.high, value)
-        self.total += value
+        self.total += value * _SMALL
 
     def report(self) -> dict[str, float | int]:
         """As JSON has it; only the count where there is nothing."""
-        if not self.count:
-            return {'count': 0}
-        mean = self.total / self.count
-        return {'count': self.count, 'min': self.low, 'max': self.high, 'mean': mean}
+        found: dict[str, float | int] = {'count': self.count}
+        if self.count:
+            found |= {'min': self.low, 'max': self.high, 'mean': self.total / self.count / _SMALL}
+        return found | ({'not_finite': self.not_finite} if self.not_finite else {})
 
 
 @dataclass
@@ -107,7 +113,7 @@ class Run:
         except ValueError:
             return  # of `verify`
         if isinstance(said, dict):
-            self.settings = {name: said[name] for name in SETTINGS if name in said}
+            self.settings = {name: _plain(said[name]) for name in SETTINGS if name in said}
 
     def _steps(self, record: Transitions) -> None:
         source = self.sources.setdefault(record.source, Source())
@@ -129,7 +135,7 @@ class Run:
             'steps': sum(source.steps for source in self.sources.values()),
             'episodes': sum(source.episodes for source in self.sources.values()),
             'phases': self.phases.report(),
-            'segments_scored': self.scores.count,
+            'segments_scored': self.scores.count + self.scores.not_finite,
             'steps_scored': self.scored_steps,
             'scores': self.scores.report(),
             'policy_versions': self.policy_versions.report(),
@@ -137,6 +143,14 @@ class Run:
             'labels': self.labels,
             'evaluations': {n: r.report() for n, r in sorted(self.evaluations.items())},
         }
+
+
+def _plain(value: Any) -> Any:
+    """A value of damaged settings as JSON has it: what is no number there is text."""
+    try:
+        return json.loads(json.dumps(value, allow_nan=False))
+    except ValueError:
+        return str(value)
 
 
 def namespace_of(entry: Entry) -> str:

@@ -40,7 +40,7 @@ def main(arguments: Sequence[str]) -> int:
     except BagError as error:
         return refuse(str(error))
     if given.json:
-        print(json.dumps(found, indent=2))
+        print(json.dumps(found, indent=2, allow_nan=False))
     else:
         show(found, Console())
     return 0
@@ -103,15 +103,18 @@ def _run(run: Mapping[str, Any]) -> Table:
     table.add_row('labels', str(run['labels']))
     if run['evaluations']:
         step, last = list(run['evaluations'].items())[-1]
-        text = f'{len(run["evaluations"])}, true return at step {step}: {last["mean"]:.6g}'
+        text = f'{len(run["evaluations"])}, true return at step {step}: {_span(last)}'
         table.add_row('evaluations', text)
     return table
 
 
 def _span(values: Mapping[str, float]) -> str:
+    wrong = values.get('not_finite', 0)
+    said = f'{wrong} not finite' if wrong else ''
     if not values['count']:
-        return 'none'
-    return f'{values["min"]:.6g} to {values["max"]:.6g}, mean {values["mean"]:.6g}'
+        return said or 'none'
+    text = f'{values["min"]:.6g} to {values["max"]:.6g}, mean {values["mean"]:.6g}'
+    return f'{text}; {said}' if said else text
 
 
 def _whole_span(values: Mapping[str, float]) -> str:
