@@ -5,7 +5,9 @@ profile `ros2`, schemas as .msg text with all that they contain, `offered_qos_pr
 `topic_type_hash` at each channel. A file that has reached a size is finished, index included, and
 the next one begun. A process that is killed leaves its last file without index and the folder
 without metadata (so that no reader takes the bag for whole): every flushed message can still be
-read from it in order (`mcap.stream_reader`).
+read from it in order (`mcap.stream_reader`). The definitions lie in its first chunk, and again in
+a later one whenever the file has doubled, since only a finished file has them at its end too: of a
+file whose beginning is damaged, what lies behind as much again is read all the same.
 
 Messages are taken as the CDR bytes that came: nothing is decoded, so nothing can change.
 """
@@ -107,6 +109,7 @@ class McapWriter:
         )
         self._writer.start(profile='ros2', library='codetr_ros')
         self._channels: dict[str, int] = {}
+        self._again = self._stream.tell() + 1  # where to describe them next: in the second chunk
         schemas: dict[str, int] = {}
         for topic, text, digest in described:
             if topic.type not in schemas:
@@ -147,6 +150,7 @@ class McapWriter:
             if 0 < self._split_bytes <= self._stream.tell():
                 self._finish_file()
                 self._open_file()
+            self._describe_again()
             self._writer.add_message(
                 self._channels[topic], log_time, data, publish_time, self.counts[topic]
             )
@@ -154,6 +158,21 @@ class McapWriter:
             raise self._broken(error) from error
         self.counts[topic] += 1
         self._files[-1].add(topic, log_time)
+
+    def _describe_again(self) -> None:
+        """Repeat schemas and channels at the beginning of the next chunk, if it is time."""
+        if (at := self._stream.tell()) < self._again:
+            return
+        self._again = 2 * at
+        # mcap's writer has no call for it; the format allows it, as often as one likes
+        chunk, schemas, channels = (
+            getattr(self._writer, f'_Writer__{name}')
+            for name in ('chunk_builder', 'schemas', 'channels')
+        )
+        for schema in schemas.values():
+            chunk.add_schema(schema)
+        for channel in channels.values():
+            chunk.add_channel(channel)
 
     def _sync(self) -> None:
         self._writer.flush()
