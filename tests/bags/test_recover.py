@@ -1,17 +1,23 @@
+import errno
+import io
 import json
 import os
 import sqlite3
+import struct
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import pytest
+from bags.damage import killed
 from bags.making import WRITERS, a_run, by_mcap, ours
 from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
 from codetr_ros.bags.definitions import encode
 from codetr_ros.bags.errors import BagError
+from codetr_ros.bags.mcap_layout import next_chunk
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.recover import recover
 from codetr_ros.bags.topics import schema_text
@@ -29,6 +35,10 @@ def messages(path, on_damage=None):
         (m.channel.topic, m.channel.type, m.log_time, m.publish_time, m.sequence, bytes(m.data))
         for m in Bag(path, on_damage).raw()
     ]
+
+
+def ignored(damage):
+    """The missing end of a killed recorder's file, which is no news."""
 
 
 def flip(path, at):
@@ -241,3 +251,179 @@ def test_a_recovered_bag_is_read_as_the_run_that_it_was(tmp_path):
     recover(bag, tmp_path / 'new')
     (spec,) = Bag(tmp_path / 'new').entries([RunSpec])
     assert spec.record.settings == RUN[0].settings
+
+
+def test_a_killed_recorders_file_is_kept_but_for_its_damaged_first_chunk(tmp_path):
+    """The first chunk described the topics; a file without its end does not repeat them there."""
+    bag = killed(tmp_path / 'bag', RUN)
+    whole = messages(bag, ignored)
+    first = [e.place for e in Bag(bag, ignored).entries()]
+    lost = sum(place.offset == first[0].offset for place in first)
+    flip(first[0].file, first[0].offset + 500)
+    found = recover(bag, tmp_path / 'new')
+    assert messages(tmp_path / 'new') == whole[lost:] and 0 < lost < 5
+    assert 'its CRC is' in found.said[0].text
+
+
+def test_damaged_chunks_at_the_beginning_cost_no_more_than_as_much_again(tmp_path):
+    bag = killed(tmp_path / 'bag', a_run(phases=40))
+    whole = messages(bag, ignored)
+    places = [entry.place.offset for entry in Bag(bag, ignored).entries()]
+    damaged = [at for at in sorted(set(places)) if at < 40_000]
+    for at in damaged:
+        flip(bag / 'bag_0.mcap', at + 500)
+    recover(bag, tmp_path / 'new')
+    kept = messages(tmp_path / 'new')
+    assert kept == whole[-len(kept) :]
+    assert places[-len(kept)] < 100_000 < places[-1]
+
+
+class BadDisk(io.FileIO):
+    """A file of which the disk does not give some bytes: it reads up to there, and then fails."""
+
+    def __init__(self, path, bad):
+        super().__init__(path)
+        self.bad = bad
+
+    def readinto(self, buffer):
+        at = self.tell()
+        if at in self.bad:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        most = self.bad.start - at if at < self.bad.start else len(buffer)
+        return super().readinto(memoryview(buffer)[:most])
+
+
+@pytest.fixture
+def bad_disk(monkeypatch):
+    """Makes a range of bytes of a file unreadable."""
+
+    def make(path, bad):
+        opened = Path.open
+
+        def open_(self, mode='r', *more, **others):
+            if self == path:
+                return io.BufferedReader(BadDisk(self, bad))
+            return opened(self, mode, *more, **others)
+
+        monkeypatch.setattr(Path, 'open', open_)
+
+    return make
+
+
+@pytest.mark.parametrize('lost', [1, -1], ids=['amid the bag', 'at its end'])
+def test_a_split_that_the_disk_does_not_give_costs_itself_and_the_exit_code(
+    lost, tmp_path, bad_disk, capsys
+):
+    bag = ours(tmp_path / 'bag', a_run(phases=40), split_bytes=32_000)
+    files = Bag(bag).files
+    path = files[lost]
+    whole = [(m.place.file, bytes(m.data)) for m in Bag(bag).raw()]
+    bad_disk(path, range(path.stat().st_size))
+    with pytest.raises(BagError, match=f'{path.name} byte 0: cannot be read: Input/output error'):
+        list(Bag(bag).raw())
+    assert main(['bag', 'recover', str(bag), '--out', str(tmp_path / 'new')]) == 1
+    said = capsys.readouterr().out
+    size = path.stat().st_size
+    assert f'{path} byte 0: cannot be read: Input/output error ({size} bytes lost)' in said
+    assert 'its writer was killed' not in said
+    kept = [bytes(m.data) for m in Bag(tmp_path / 'new').raw()]
+    assert kept == [data for file, data in whole if file != path] and len(files) > 3
+
+
+@pytest.mark.parametrize('length', [1, 512, 9000])
+def test_a_bad_sector_costs_the_chunks_it_lies_in_and_at_most_as_much_again(
+    length, tmp_path, bad_disk
+):
+    bag = ours(tmp_path / 'bag', a_run(phases=40))
+    path = bag / 'bag_0.mcap'
+    places = [entry.place.offset for entry in Bag(bag).entries()]
+    whole = messages(bag)
+    starts = sorted(set(places))
+    chunk = starts[len(starts) // 2]
+    bad = range(chunk + 700, chunk + 700 + length)
+    bad_disk(path, bad)
+    found = recover(bag, tmp_path / 'new')
+    kept = messages(tmp_path / 'new')
+    before = places.index(chunk)
+    behind = len(kept) - before
+    assert kept == whole[:before] + whole[-behind:]
+    sound = min(start for start in starts if start >= bad.stop)
+    if length <= 512:
+        assert behind == len(places) - places.index(sound), 'no other chunk is lost'
+    assert places[-behind] < bad.stop + length + 8192
+    assert found.unread and not found.whole
+
+
+def test_a_file_whose_beginning_the_disk_does_not_give_is_read_behind_it(tmp_path, bad_disk):
+    bag = ours(tmp_path / 'bag', RUN)
+    whole = messages(bag)
+    bad_disk(bag / 'bag_0.mcap', range(512))
+    recover(bag, tmp_path / 'new')
+    kept = messages(tmp_path / 'new')
+    assert kept == whole[-len(kept) :] and len(whole) - len(kept) < 10
+
+
+def test_a_split_that_is_no_file_costs_only_itself(tmp_path):
+    bag = ours(tmp_path / 'bag', a_run(phases=40), split_bytes=32_000)
+    last = Bag(bag).files[-1]
+    last.unlink()
+    last.mkdir()
+    assert main(['bag', 'recover', str(bag), '--out', str(tmp_path / 'new')]) == 1
+    assert messages(tmp_path / 'new') == messages(bag, ignored) != []
+
+
+def test_a_last_split_that_is_missing_is_a_loss(tmp_path, capsys):
+    bag = ours(tmp_path / 'bag', a_run(phases=40), split_bytes=32_000)
+    last = Bag(bag).files[-1]
+    last.unlink()
+    assert main(['bag', 'recover', str(bag), '--out', str(tmp_path / 'new')]) == 1
+    assert f'lacks {last.name}' in capsys.readouterr().out
+
+
+CHUNK = b'\x06' + struct.pack('<Q32xQ', 32 + 8 + 5, 5) + b'12345'
+
+
+@pytest.mark.parametrize('border', [1 << 20, 3 << 20])
+def test_a_chunk_is_found_wherever_it_begins(border):
+    for at in range(border - len(CHUNK) - 1, border + 3):
+        data = b'\xff' * at + CHUNK + b'\xff' * 60
+        assert next_chunk(io.BytesIO(data), 0, len(data)) == at
+        assert next_chunk(io.BytesIO(data), at + 1, len(data)) == len(data)
+
+
+@pytest.mark.parametrize('listed', ['bag_0.mcap', 'elsewhere/bag_0.mcap'])
+def test_a_file_that_is_listed_twice_is_named_and_read_once(listed, tmp_path):
+    bag = ours(tmp_path / 'bag', RUN)
+    whole = messages(bag)
+    path = bag / 'metadata.yaml'
+    text = path.read_text()
+    paths = '  relative_file_paths:\n  - bag_0.mcap\n'
+    assert paths in text
+    path.write_text(text.replace(paths, f'{paths}  - {listed}\n'))
+    with pytest.raises(BagError, match=r'metadata.yaml lists bag_0.mcap 2 times, and its messag'):
+        Bag(bag)
+    said = []
+    assert messages(bag, said.append) == whole and 'lists bag_0.mcap 2 times' in said[0].text
+    assert not verify(bag).sound
+    recover(bag, tmp_path / 'new')
+    assert messages(tmp_path / 'new') == whole
+
+
+def test_nothing_is_left_of_a_bag_that_could_not_be_made(tmp_path):
+    (tmp_path / 'bag.mcap').write_bytes(b'')
+    (tmp_path / 'there').mkdir()
+    for new in ('new', 'there'):
+        with pytest.raises(BagError, match=f'{new} is not made: is empty'):
+            recover(tmp_path / 'bag.mcap', tmp_path / new)
+    assert sorted(p.name for p in tmp_path.rglob('*')) == ['bag.mcap', 'there']
+
+
+@pytest.mark.parametrize('there', [False, True])
+def test_a_new_bag_appears_whole(there, tmp_path):
+    bag = ours(tmp_path / 'bag', RUN)
+    new = tmp_path / 'deep' / 'new'
+    if there:
+        new.mkdir(parents=True)
+    recover(bag, new)
+    assert sorted(p.name for p in new.iterdir()) == ['metadata.yaml', 'new_0.mcap']
+    assert [p.name for p in new.parent.iterdir()] == ['new']

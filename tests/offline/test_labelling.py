@@ -193,3 +193,4 @@ def test_times_that_a_message_cannot_say_are_refused_by_name(a_run, fitted, tmp_
     )  # fmt: skip
     label(old, fitted, tmp_path / 'new', code=2)
     assert 'StepRewards cannot be written' in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ['old'], 'nothing unfinished is left'

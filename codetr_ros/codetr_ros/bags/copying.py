@@ -16,9 +16,8 @@ import yaml
 from mcap.writer import CompressionType, Writer
 
 from codetr_ros.bags.definitions import bundled_text
-from codetr_ros.bags.errors import BagError
-from codetr_ros.bags.mcap_file import LIBRARY, Channel, RawMessage
 from codetr_ros.bags.metadata import METADATA, BagFile, load_yaml, render
+from codetr_ros.bags.raw import LIBRARY, Channel, RawMessage
 from codetr_ros.bags.writer import CHUNK_BYTES
 from codetr_ros.run_folder import atomic_write, sync_folder
 
@@ -45,7 +44,8 @@ class _Topic:
             said = load_yaml(self.channel.qos)
         except (yaml.YAMLError, ValueError, RecursionError):  # of dates and numbers, too
             return []
-        return said if isinstance(said, list) else []
+        listed = isinstance(said, list) and all(isinstance(one, dict) for one in said)
+        return said if listed else []
 
 
 @dataclass
@@ -117,18 +117,12 @@ def copy(messages: Iterable[RawMessage], folder: Path, library: str) -> Copied:
 
     Args:
         messages: in their order.
-        folder: does not exist, or is empty.
+        folder: there, and empty.
         library: who the files say that they are by, where their own recorder did not number them.
 
     Raises:
-        BagError: the folder holds something.
         OSError: it cannot be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    if there := sorted(path.name for path in folder.iterdir()):
-        raise BagError(
-            f'{folder} exists and holds {there[0]}: choose another folder, or remove it'
-        )
     made = Copied()
     with ExitStack() as stack:
         file, source = None, None

@@ -31,6 +31,7 @@ class Damage(NamedTuple):
     text: str
     lost: int  # bytes that could not be read; 0 where nothing is known to be missing
     harmless: bool = False  # no message is missing or wrong by it: only an index or a summary is
+    unread: bool = False  # the disk does not give what lies there: nobody knows what is lost by it
 
     def error(self) -> BagError:
         """The same as an error, with the remedy."""

@@ -3,6 +3,7 @@
 import os
 import re
 import stat
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path, PurePath
 
@@ -53,7 +54,8 @@ def bag_files(path: Path, on_damage: Callable[[Damage], None] | None) -> list[Pa
     """The files of a bag, in order: as its metadata lists them, then by number.
 
     Raises:
-        BagError: there are none, or one is missing (unless that is told to `on_damage`).
+        BagError: there are none. Or one is missing, is no file or is listed twice (unless that is
+            told to `on_damage`, and the others are what there is).
     """
     try:
         mode = path.stat().st_mode
@@ -66,24 +68,58 @@ def bag_files(path: Path, on_damage: Callable[[Damage], None] | None) -> list[Pa
         there = {name for name in os.listdir(path) if storage_of(name) in STORAGES}
     except OSError as error:
         raise BagError(f'{path} cannot be read: {error.strerror}') from error
+
+    def tell(where: Path, error: BagError, unread: bool) -> None:
+        if on_damage is None:
+            raise error
+        on_damage(Damage(Place(where, 0), str(error), 0, unread=unread))
+
+    listed: list[str] = []
     try:
         listed = listed_files(path)
-        if missing := [name for name in listed if name not in there]:
-            raise BagError(
-                f'bag {path} lacks {missing[0]}, which its {METADATA} lists: put it back, or make '
-                'a whole bag of the rest with `codetr bag recover`'
-            )
     except BagError as error:
-        if on_damage is None:
-            raise
-        on_damage(Damage(Place(path / METADATA, 0), str(error), 0))
-        listed = []
-    names = [*listed, *sorted(there - set(listed), key=_number)]
+        tell(path / METADATA, error, False)
+    for name, times in Counter(listed).items():
+        if name not in there:
+            tell(path / METADATA, _lacking(path, name), True)
+        elif times > 1:
+            tell(path / METADATA, _listed_again(path, name, times), False)
+    known = [name for name in dict.fromkeys(listed) if name in there]
+    names = [*known, *sorted(there - set(known), key=_number)]
     if not names:
         raise BagError(f'{path} is no bag: it holds no file of {_named()}')
+    return _files(path, names, tell)
+
+
+def _listed_again(path: Path, name: str, times: int) -> BagError:
+    return BagError(
+        f'{path / METADATA} lists {name} {times} times, and its messages are there once: remove '
+        'what is too much, or make a whole bag with `codetr bag recover`'
+    )
+
+
+def _lacking(path: Path, name: str) -> BagError:
+    return BagError(
+        f'bag {path} lacks {name}, which its {METADATA} lists: put it back, or make a whole bag '
+        'of the rest with `codetr bag recover`'
+    )
+
+
+def _files(
+    path: Path, names: list[str], tell: Callable[[Path, BagError, bool], None]
+) -> list[Path]:
+    """Those that are files; at least one."""
+    found: list[Path] = []
     for name in names:
-        _check_file(path / name)
-    return [path / name for name in names]
+        try:
+            _check_file(path / name)
+        except BagError as error:
+            if not found and name == names[-1]:
+                raise
+            tell(path / name, error, True)
+        else:
+            found.append(path / name)
+    return found
 
 
 def _named() -> str:

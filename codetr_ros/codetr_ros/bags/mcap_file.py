@@ -9,16 +9,16 @@ fault reading goes on at the next chunk. The records themselves are taken apart 
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 from mcap import records as mcap_records
 from mcap.opcode import Opcode
 
 from codetr_ros.bags.definitions import Definition
-from codetr_ros.bags.errors import BagError, Damage, Place
+from codetr_ros.bags.errors import Damage, Place
 from codetr_ros.bags.mcap_index import IndexChecks
 from codetr_ros.bags.mcap_layout import (
     CHUNK,
@@ -37,32 +37,7 @@ from codetr_ros.bags.mcap_layout import (
     resume_at,
     summary_records,
 )
-
-OnDamage = Callable[[Damage], None]
-LIBRARY = 'codetr_ros'
-"""What our recorder calls itself in a file."""
-
-
-class Channel(NamedTuple):
-    """A topic of a bag."""
-
-    topic: str  # full name
-    type: str  # such as codetr_msgs/msg/Transitions
-    encoding: str  # of the messages: 'cdr'
-    definition: Definition
-    qos: str  # as YAML text, as the bag has it; may be empty
-    numbered: bool = False  # its messages are numbered 0, 1, 2, ...: our recorder wrote them
-
-
-class RawMessage(NamedTuple):
-    """A message as it lies in a bag."""
-
-    channel: Channel
-    log_time: int  # [ns] when it was received
-    publish_time: int  # [ns] as received where the bag does not say
-    sequence: int  # as the file numbers it; 0 where it does not
-    data: bytes | memoryview  # CDR; a view is valid until the next message is asked for
-    place: Place
+from codetr_ros.bags.raw import LIBRARY, Channel, OnDamage, RawMessage
 
 
 class McapFile:
@@ -122,15 +97,20 @@ class McapFile:
             with self.path.open('rb') as file:
                 yield from self._records(file)
         except OSError as error:
-            raise BagError(f'{self.shown} cannot be read: {error.strerror}') from error
+            lost = 0
+            with suppress(OSError):
+                lost = self.path.stat().st_size
+            self._say(0, f'cannot be read: {error.strerror}', lost, unread=True)
 
     def _compare(self, at: int, texts: Iterator[str]) -> None:
         """Say what an index has wrong: no message is by that."""
         for text in texts:
             self._say(at, text, 0, harmless=True)
 
-    def _say(self, offset: int, text: str, lost: int, harmless: bool = False) -> None:
-        damage = Damage(Place(self.shown, offset), text, lost, harmless)
+    def _say(
+        self, offset: int, text: str, lost: int, harmless: bool = False, unread: bool = False
+    ) -> None:
+        damage = Damage(Place(self.shown, offset), text, lost, harmless, unread)
         self._faulty |= not harmless
         if self._on_damage is not None:
             self._on_damage(damage)
@@ -140,10 +120,9 @@ class McapFile:
     def _records(self, file: BinaryIO) -> Iterator[RawMessage]:
         size = file.seek(0, 2)
         file.seek(0)
-        if (magic := file.read(len(MAGIC))) != MAGIC:
-            text = 'is empty' if not size else f'begins with {magic!r}: it is no MCAP file'
-            self._say(0, text, size if size < len(MAGIC) else 0)
-        at = file.tell()
+        at = self._begin(file, size)
+        if at == size > len(MAGIC):
+            return  # the disk gives nothing of it
         ended = False
         while at < size:
             try:
@@ -163,10 +142,33 @@ class McapFile:
                 self._say(at, str(fault), after - at, harmless=ended)
                 self._indexed = None
                 at = after
+            except OSError as error:
+                at = self._unread(file, at, size, error)
+                if at == size:
+                    return
             if self._faulty and not self._borrowed:
                 self._borrow(file, size)
             file.seek(at)
         self._say(size, 'the file ends here, without its index: its writer was killed', 0)
+
+    def _begin(self, file: BinaryIO, size: int) -> int:
+        """Check how the file begins; where its records do."""
+        try:
+            magic = file.read(len(MAGIC))
+        except OSError as error:
+            file.seek(after := self._unread(file, 0, size, error))
+            return after
+        if magic != MAGIC:
+            text = 'is empty' if not size else f'begins with {magic!r}: it is no MCAP file'
+            self._say(0, text, size if size < len(MAGIC) else 0)
+        return len(magic)
+
+    def _unread(self, file: BinaryIO, at: int, size: int, error: OSError) -> int:
+        """Say that the disk does not give what lies there; where to go on."""
+        after = resume_at(file, at, size)
+        self._say(at, f'cannot be read: {error.strerror}', after - at, unread=True)
+        self._indexed = None
+        return after
 
     def _borrow(self, file: BinaryIO, size: int) -> None:
         """Take topics from the summary, which repeats them: the chunk that described them may be

@@ -1,6 +1,5 @@
 """How an MCAP file is laid out: its records, and where the next sound one begins."""
 
-import mmap
 import re
 import struct
 import zlib
@@ -24,6 +23,8 @@ CHUNK = struct.Struct('<QQQII')  # start, end, size, crc, length of the compress
 MESSAGE = struct.Struct('<BQHIQQ')  # head, channel, sequence, log time, publish time
 MESSAGE_BODY = MESSAGE.size - HEAD.size
 _PIECE = 1 << 20
+_SECTOR = 4096
+_LONGEST_START = HEAD.size + CHUNK.size + len('zstd') + 8  # of what `_CHUNK_START` matches
 _CHUNK_START = re.compile(
     rb'\x06.{8}.{28}(?:\x00{4}|\x03\x00{3}lz4|\x04\x00{3}zstd).{8}', re.DOTALL
 )
@@ -149,37 +150,68 @@ def resume_at(file: BinaryIO, at: int, size: int) -> int:
     follows by its length, whichever comes first.
     """
     chunk = next_chunk(file, at + 1, size)
-    file.seek(at)
-    head = file.read(HEAD.size)
-    if len(head) < HEAD.size:
-        return size
-    follows: int = at + HEAD.size + HEAD.unpack(head)[1]
-    if follows >= min(chunk, size - HEAD.size):
+    try:
+        file.seek(at)
+        head = file.read(HEAD.size)
+        if len(head) < HEAD.size:
+            return size
+        follows: int = at + HEAD.size + HEAD.unpack(head)[1]
+        if follows >= min(chunk, size - HEAD.size):
+            return chunk
+        file.seek(follows)
+        opcode, length = HEAD.unpack(file.read(HEAD.size))
+    except OSError:  # of the disk: said by who asks
         return chunk
-    file.seek(follows)
-    opcode, length = HEAD.unpack(file.read(HEAD.size))
     known = opcode in Opcode.__members__.values()
     return follows if known and follows + HEAD.size + length <= size else chunk
 
 
 def next_chunk(file: BinaryIO, at: int, size: int) -> int:
-    """Where the next chunk begins whose lengths agree; the file's size if there is none."""
-    if at >= size:
-        return size
-    with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as view:
-        while match := _CHUNK_START.search(view, at):
-            found, name = match.start(), CHUNK.size
-            _, length = HEAD.unpack_from(view, found)
-            (named,) = struct.unpack_from('<I', view, found + HEAD.size + name - 4)
-            (data,) = struct.unpack_from('<Q', view, found + HEAD.size + name + named)
-            if length == name + named + 8 + data and found + HEAD.size + length <= size:
-                return found
-            at = found + 1
+    """Where the next chunk begins whose lengths agree; the file's size if there is none.
+
+    What the disk does not give is passed over, at doubling distances: each try may take seconds.
+    """
+    length, skip = _PIECE, _SECTOR
+    while at < size:
+        try:
+            file.seek(at)
+            view = file.read(length + _LONGEST_START - 1)
+        except OSError:
+            if length > _SECTOR:
+                length = _SECTOR  # perhaps only the end of so much
+            else:
+                at, skip = at + skip, 2 * skip
+            continue
+        found = _chunk_in(view, length, size - at)
+        if found is not None:
+            return at + found
+        at += length
+        length, skip = min(2 * length, _PIECE), _SECTOR
     return size
+
+
+def _chunk_in(view: bytes, length: int, left: int) -> int | None:
+    """Where in the first `length` bytes a chunk begins that ends within those that are left."""
+    at = 0
+    while (match := _CHUNK_START.search(view, at)) and (found := match.start()) < length:
+        _, size = HEAD.unpack_from(view, found)
+        (named,) = struct.unpack_from('<I', view, found + HEAD.size + CHUNK.size - 4)
+        (data,) = struct.unpack_from('<Q', view, found + HEAD.size + CHUNK.size + named)
+        if size == CHUNK.size + named + 8 + data and found + HEAD.size + size <= left:
+            return found
+        at = found + 1
+    return None
 
 
 def summary_records(file: BinaryIO, size: int) -> list[Any]:
     """The summary's schemas and channels; none unless its checksum says that it is as written."""
+    try:
+        return _summary_records(file, size)
+    except OSError:  # of the disk: said by who reads that far
+        return []
+
+
+def _summary_records(file: BinaryIO, size: int) -> list[Any]:
     tail = HEAD.size + 20 + len(MAGIC)  # footer and magic
     if size < tail:
         return []

@@ -24,8 +24,9 @@ from rosbags.typesys.store import Typestore
 from codetr_ros.bags.definitions import Definition, check_own, decode, parsed
 from codetr_ros.bags.errors import BagError, Damage, Place
 from codetr_ros.bags.files import COMPRESSED, bag_files
-from codetr_ros.bags.mcap_file import McapFile, OnDamage, RawMessage
+from codetr_ros.bags.mcap_file import McapFile
 from codetr_ros.bags.mcap_layout import LARGEST_RECORD, unzstd
+from codetr_ros.bags.raw import OnDamage, RawMessage
 from codetr_ros.bags.sqlite_file import SqliteFile
 from codetr_ros.received import RECORD_TYPES, type_name
 from codetr_ros.records import Record, RecordError
@@ -229,9 +230,13 @@ class Bag:
 
     def _damaged(self, message: RawMessage, text: str) -> None:
         damage = Damage(message.place, f'{message.channel.topic}: {text}', len(message.data))
-        if self.on_damage is None:
-            raise damage.error()
-        self.on_damage(damage)
+        _tell(damage, self.on_damage)
+
+
+def _tell(damage: Damage, on_damage: OnDamage | None) -> None:
+    if on_damage is None:
+        raise damage.error()
+    on_damage(damage)
 
 
 def open_file(
@@ -250,13 +255,11 @@ def open_file(
     try:
         with path.open('rb') as packed, unpacked.open('wb') as file:
             shutil.copyfileobj(zstandard.ZstdDecompressor().stream_reader(packed), file)
-    except OSError as error:
-        raise BagError(f'{path} cannot be unpacked to {unpacked}: {error.strerror}') from error
     except zstandard.ZstdError as error:
-        damage = Damage(Place(path, 0), f'its zstd data is damaged ({error})', 0)
-        if on_damage is None:
-            raise damage.error() from None
-        on_damage(damage)
+        _tell(Damage(Place(path, 0), f'its zstd data is damaged ({error})', 0), on_damage)
+    except OSError as error:
+        text = f'cannot be unpacked to {unpacked}: {error.strerror}'
+        _tell(Damage(Place(path, 0), text, 0, unread=True), on_damage)
     return _KINDS[unpacked.suffix](unpacked, on_damage, path, thorough)
 
 

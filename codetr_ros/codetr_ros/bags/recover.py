@@ -13,8 +13,9 @@ from typing import Any
 
 from codetr_ros.bags.copying import copy, describe
 from codetr_ros.bags.errors import BagError, Damage
-from codetr_ros.bags.mcap_file import LIBRARY
+from codetr_ros.bags.raw import LIBRARY
 from codetr_ros.bags.reader import Bag
+from codetr_ros.bags.unfinished import unfinished
 from codetr_ros.bags.verify import Verdict, verify
 
 SAID = 1000
@@ -31,12 +32,19 @@ class Recovery:
     bytes: int = 0  # of the messages that were kept
     lost: int = 0  # bytes of the old bag that could not be read
     faults: int = 0
+    unread: int = 0  # of these, such that the disk does not give what was there
     said: list[Damage] = field(default_factory=list)
     verdict: Verdict | None = None  # on the new bag
+
+    @property
+    def whole(self) -> bool:
+        """Whether nothing is missing but what a killed recorder had not finished."""
+        return self.verdict is not None and self.verdict.sound and not self.unread
 
     def note(self, damage: Damage) -> None:
         """Something could not be read."""
         self.faults += 1
+        self.unread += damage.unread
         self.lost += damage.lost
         if len(self.said) < SAID:
             self.said.append(damage)
@@ -50,6 +58,7 @@ class Recovery:
             'topics': dict(sorted(self.messages.items())),
             'bytes': self.bytes,
             'faults': self.faults,
+            'unread': self.unread,
             'bytes_lost': self.lost,
             'losses': [
                 {'place': str(d.place), 'text': d.text, 'bytes': d.lost} for d in self.said
@@ -71,18 +80,19 @@ def recover(old: Path | str, new: Path | str) -> Recovery:
     found = Recovery(Path(old), Path(new))
     bag = Bag(found.old, found.note)
     try:
-        copied = copy(bag.raw(), found.new, f'recovered by {LIBRARY}')
-        found.messages, found.bytes = copied.messages, copied.bytes
-        if not copied.files:
-            raise BagError(
-                f'no message of {old} can be read, {new} stays empty: '
-                + (found.said[0].text if found.said else 'it holds none')
-            )
-        describe(copied, found.new)
+        with unfinished(found.new) as folder:
+            copied = copy(bag.raw(), folder, f'recovered by {LIBRARY}')
+            found.messages, found.bytes = copied.messages, copied.bytes
+            if not copied.files:
+                raise BagError(
+                    f'no message of {old} can be read, {new} is not made: '
+                    + (found.said[0].text if found.said else 'it holds none')
+                )
+            describe(copied, folder)
     except OSError as error:
         raise BagError(
-            f'{new} cannot be written: {error.strerror}. What it holds is unfinished: remove it, '
-            f'make room, and recover {old} again'
+            f'{new} cannot be written: {error.strerror}. Nothing of it is left: make room, and '
+            f'recover {old} again'
         ) from error
     found.verdict = verify(found.new)
     return found

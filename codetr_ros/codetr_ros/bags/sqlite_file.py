@@ -10,9 +10,9 @@ from pathlib import Path
 from urllib.parse import quote
 
 from codetr_ros.bags.definitions import Definition
-from codetr_ros.bags.errors import BagError, Damage, Place
-from codetr_ros.bags.mcap_file import Channel, OnDamage, RawMessage
+from codetr_ros.bags.errors import Damage, Place
 from codetr_ros.bags.mcap_layout import LARGEST_RECORD
+from codetr_ros.bags.raw import Channel, OnDamage, RawMessage
 
 _DAMAGED = (sqlite3.Error, UnicodeDecodeError, OverflowError)
 _FARTHEST = 1 << 40  # rows beyond a damaged one at which to look for the next
@@ -56,7 +56,8 @@ class SqliteFile:
                 told to `on_damage`).
         """
         try:
-            size = self.path.stat().st_size
+            with self.path.open('rb') as file:
+                size = file.seek(0, 2)
             if not size:
                 raise sqlite3.DatabaseError('it is empty')
             connection = self._connect()
@@ -66,9 +67,9 @@ class SqliteFile:
             finally:
                 connection.close()
         except OSError as error:
-            raise BagError(f'{self.shown} cannot be read: {error.strerror}') from error
+            self._say(0, f'cannot be read: {error.strerror}', 0, unread=True)
         except _DAMAGED as error:
-            self._say(0, f'the database is damaged: {error}', 0)
+            self._say(0, f'the database is damaged: {error}', 0, _unread(error))
 
     def _rows(self, connection: sqlite3.Connection, most: int) -> Iterator[RawMessage]:
         """The messages; behind rows that cannot be read it goes on at the next that can."""
@@ -85,6 +86,7 @@ class SqliteFile:
                     row + 1,
                     f'rows {row + 1} to {until} cannot be read, if there are any: {error}',
                     0,
+                    _unread(error),
                 )
                 if following is None:
                     return
@@ -117,8 +119,8 @@ class SqliteFile:
             self.unchecked += 1
             yield RawMessage(channel, time, time, 0, data, Place(self.shown, row))
 
-    def _say(self, row: int, text: str, lost: int) -> None:
-        damage = Damage(Place(self.shown, row), text, lost or 0)
+    def _say(self, row: int, text: str, lost: int, unread: bool = False) -> None:
+        damage = Damage(Place(self.shown, row), text, lost or 0, unread=unread)
         if self._on_damage is None:
             raise damage.error()
         self._on_damage(damage)
@@ -131,6 +133,11 @@ class SqliteFile:
         left = journal.exists() and journal.stat().st_size
         how = 'mode=ro' if left else 'mode=ro&immutable=1'
         return sqlite3.connect(f'file:{quote(str(self.path))}?{how}', uri=True)
+
+
+def _unread(error: Exception) -> bool:
+    """Whether the disk is at fault, not what is on it: SQLite says so in these words."""
+    return 'disk I/O error' in str(error)
 
 
 def _next_row(connection: sqlite3.Connection, row: int, most: int) -> int | None:

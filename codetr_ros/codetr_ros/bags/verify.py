@@ -15,7 +15,7 @@ from codetr_ros.bags.episodes import missing_numbers
 from codetr_ros.bags.errors import BagError, Damage
 from codetr_ros.bags.findings import Findings
 from codetr_ros.bags.info import namespace_of
-from codetr_ros.bags.mcap_file import RawMessage
+from codetr_ros.bags.raw import RawMessage
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.run_checks import RunChecks
 

@@ -22,8 +22,8 @@ class Arguments:
     """Make a whole bag (index, metadata) of what can be read of a damaged or unfinished one.
 
     Every message that can be read is kept byte for byte, in order; what was lost is said. The old
-    bag is not touched. Exit code 0: the new bag is sound, 1: something within it is missing, 2:
-    nothing could be done.
+    bag is not touched. Exit code 0: the new bag is sound, 1: something within it is missing, or
+    the disk does not give all of the old one, 2: nothing could be done.
     """
 
     bag: Annotated[
@@ -51,10 +51,10 @@ def main(arguments: Sequence[str]) -> int:
     except BagError as error:
         return refuse(str(error))
     if given.json:
-        print(json.dumps(found.report(), indent=2))
+        print(json.dumps(found.report(), indent=2, allow_nan=False))
     else:
         show(found.report(), Console(soft_wrap=True))
-    return 0 if found.verdict and found.verdict.sound else FAILED
+    return 0 if found.whole else FAILED
 
 
 def show(report: Mapping[str, Any], console: Console) -> None:

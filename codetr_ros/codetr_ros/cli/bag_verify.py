@@ -48,7 +48,7 @@ def main(arguments: Sequence[str]) -> int:
     except BagError as error:
         return refuse(str(error))
     if given.json:
-        print(json.dumps(verdict.report(), indent=2))
+        print(json.dumps(verdict.report(), indent=2, allow_nan=False))
     else:
         show(verdict.report(), given.limit, Console(soft_wrap=True))
     return 0 if verdict.sound else FAILED

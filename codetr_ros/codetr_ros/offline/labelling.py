@@ -17,9 +17,10 @@ import yaml
 from codetr_ros.bags.copying import copy, describe
 from codetr_ros.bags.definitions import Definition, encode
 from codetr_ros.bags.errors import BagError
-from codetr_ros.bags.mcap_file import LIBRARY, Channel, RawMessage
+from codetr_ros.bags.raw import LIBRARY, Channel, RawMessage
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.topics import BagTopic, schema_text, type_hash
+from codetr_ros.bags.unfinished import unfinished
 from codetr_ros.offline.episodes import Index, Key, Stretch, stretches
 from codetr_ros.offline.judging import labels_of
 from codetr_ros.offline.loading import load
@@ -67,12 +68,13 @@ def label(bag: Bag, saved: SavedModel, folder: Path, memory_steps: int) -> Label
     made = Labelled(unlabelled=found.unscored, skipped=found.skipped)
     try:
         messages = _messages(bag, index, method, found.found, memory_steps, made)
-        copied = copy(messages, folder, f'labelled by {LIBRARY}')
-        describe(copied, folder)
+        with unfinished(folder) as new:
+            copied = copy(messages, new, f'labelled by {LIBRARY}')
+            describe(copied, new)
     except OSError as error:
         raise BagError(
-            f'{folder} cannot be written: {error.strerror}. What it holds is unfinished: remove '
-            'it, make room, and label again'
+            f'{folder} cannot be written: {error.strerror}. Nothing of it is left: make room, and '
+            'label again'
         ) from error
     return made
 

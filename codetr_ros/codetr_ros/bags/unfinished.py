@@ -1,0 +1,48 @@
+"""A new bag is there when it is whole, and not before."""
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from codetr_ros.bags.errors import BagError
+from codetr_ros.bags.metadata import METADATA
+from codetr_ros.run_folder import sync_folder
+
+
+@contextmanager
+def unfinished(folder: Path) -> Iterator[Path]:
+    """A folder of the same name to write a bag in; what it holds then is moved to where it
+    belongs, or is removed after an error. One that is killed leaves `.NAME.*.unfinished`.
+
+    Args:
+        folder: where the bag belongs: does not exist, or is empty.
+
+    Raises:
+        BagError: it holds something.
+        OSError: it cannot be made or written.
+    """
+    target = Path(os.path.realpath(folder))
+    if target.exists() and (there := sorted(path.name for path in target.iterdir())):
+        raise BagError(
+            f'{folder} exists and holds {there[0]}: choose another folder, or remove it'
+        )
+    target.parent.mkdir(parents=True, exist_ok=True)
+    # within it, where it exists: it may be a disk of its own
+    room = target if target.exists() else target.parent
+    place = Path(tempfile.mkdtemp(prefix=f'.{target.name}.', suffix='.unfinished', dir=room))
+    try:
+        made = place / target.name
+        made.mkdir()
+        yield made
+        if room == target:  # the metadata, which makes it whole, comes last
+            for path in sorted(made.iterdir(), key=lambda path: path.name == METADATA):
+                os.rename(path, target / path.name)
+        else:
+            os.rename(made, target)
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
+    sync_folder(target)
+    sync_folder(target.parent)
