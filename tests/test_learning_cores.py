@@ -88,6 +88,49 @@ def test_a_frozen_method_sends_each_label_once_and_an_empty_part_where_none_is_n
     assert (second.part, second.parts, len(second.lengths)) == (0, 1, (600 // 7) - (400 // 7))
 
 
+@pytest.mark.parametrize('most', [1, 60, 10_000])
+def test_as_many_steps_as_asked_for_are_labelled_again_in_turn_oldest_first(most):
+    core, settings = labeller(relabel_steps=most, memory_steps=10_000)
+    episode = Endless(settings)
+    work = core.work()
+    episode.phase(core, 0)
+    labelled_at: dict[int, int] = {}  # first step -> gradient steps at its newest label
+    for phase in range(1, 5):
+        episode.phase(core, phase)
+        said = slices(work)
+        parts = [r for r in said if isinstance(r, StepRewards)]
+        (version,) = {p.version for p in parts}
+        done = np.concatenate([p.first_steps for p in parts]).tolist()
+        ended = set(range(0, (phase + 1) * 200 - 6, 7))
+        new, again = ended - labelled_at.keys(), set(done) & labelled_at.keys()
+        # whole segments of 7 steps within what is asked for, one at least
+        assert len(again) == min(len(labelled_at), max(1, most // 7)) and new <= set(done)
+        turn = sorted(labelled_at, key=lambda first: (labelled_at[first], first))
+        assert again == set(turn[: len(again)])
+        labelled_at |= dict.fromkeys(done, version)
+        (metrics,) = [r for r in said if isinstance(r, Metrics) and 'label_age_max' in r.names]
+        values = dict(zip(metrics.names, metrics.values, strict=True))
+        ages = [version - then for then in labelled_at.values()]
+        assert values['label_age_max'] == max(ages)
+        assert values['label_age_mean'] == pytest.approx(np.mean(ages))
+        assert values['steps_labelled'] == 7 * len(done)
+
+
+def test_labels_of_a_model_that_learns_are_all_of_its_newest_version_unless_asked_otherwise():
+    core, settings = labeller()
+    episode = Endless(settings)
+    work = core.work()
+    for phase in range(3):
+        episode.phase(core, phase)
+    said = slices(work)
+    ages = [
+        dict(zip(r.names, r.values, strict=True))['label_age_max']
+        for r in said
+        if isinstance(r, Metrics) and 'label_age_max' in r.names
+    ]
+    assert ages == [0.0, 0.0]
+
+
 def test_a_warm_up_without_scores_delays_the_fit_and_freezes_no_scale():
     core, settings = labeller()
     episode = Endless(settings)

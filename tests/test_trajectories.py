@@ -1,9 +1,12 @@
 """The memory D against a naive one that keeps everything in lists."""
 
+import tracemalloc
+
 import builders
 import numpy as np
 import pytest
 
+from codetr_ros import trajectories
 from codetr_ros.records import CompositeReward, RecordError, StepRewards, Transitions
 from codetr_ros.trajectories import Trajectories
 
@@ -279,6 +282,59 @@ def test_the_memory_takes_the_bytes_it_states():
     m.append(naive.chunk('sim', 100, 'truncated'))
     assert m.bytes_per_step == 4 * (OBSERVATION + ACTION) + 10
     assert m.nbytes == 100 * m.bytes_per_step + 4 * OBSERVATION
+
+
+def test_moments_are_those_of_all_rows_at_once_however_they_are_read(monkeypatch):
+    m, *_ = filled(4, ('a', 'b'), episodes=12, capacity=60)
+    parts = [s.observations[np.arange(s.start, s.end) % s.capacity] for s in m._sources.values()]
+    rows = np.concatenate(parts).astype(np.float64)
+    assert len(rows) > 21
+    for size in (1, 7, 1000):
+        monkeypatch.setattr(trajectories, '_PART_ROWS', size)
+        mean, deviation = m.observation_moments()
+        np.testing.assert_array_equal(mean, rows.mean(0))
+        np.testing.assert_array_equal(deviation, rows.std(0))
+
+
+@pytest.mark.parametrize('delay', [5, 25])
+@pytest.mark.parametrize('observation', [27, 105])
+@pytest.mark.parametrize('scored', [True, False])
+def test_a_step_of_ant_takes_at_most_a_tenth_more_than_its_own_numbers(scored, observation, delay):
+    """Scored as in the reward node, or labelled and sampled as in the learner."""
+    action, steps = 8, 40_000
+    rng = np.random.default_rng(0)
+    half = rng.integers(50, 450, 80)  # an episode of a bad policy ends early
+    lengths = np.stack([half, np.full_like(half, 1000)], 1).ravel()
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        m = Trajectories(observation, action, delay, steps, 0)
+        for number, length in enumerate(lengths.tolist()):
+            count = min(length, steps - m.steps)
+            if not count:
+                break
+            head = ('run', 'sim', number, 0, number, 0, count)
+            seen = rng.random((count + 1, observation), np.float32)
+            taken = rng.random((count, action), np.float32)
+            m.append(Transitions(*head, seen, taken, True, False, False, 0))
+            firsts = range(0, count, delay)
+            where = [(number, first, min(delay, count - first)) for first in firsts]
+            if scored:
+                for _, first, size in where:
+                    m.score(score('sim', number, first, size, 1.0))
+            else:
+                m.apply(labels('sim', where, np.zeros(count)))
+        assert m.steps == steps
+        if scored:
+            m.sample_segments(rng, 64)
+        else:
+            m.sample_steps(rng, 256)
+        del seen, taken, where
+        held = tracemalloc.get_traced_memory()[0] - before
+    finally:
+        tracemalloc.stop()
+    own = 4 * (observation + action) + 4 + 4 + 1 + 1  # label, its version, two flags
+    assert own * steps < m.nbytes < held < 1.1 * own * steps, held / (own * steps)
 
 
 def test_scoring_and_evicting_for_long_keeps_the_table_of_segments_small():

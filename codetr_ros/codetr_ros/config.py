@@ -362,6 +362,13 @@ class Settings(Group):
         description='step rewards that the learner sees: in units of c (decided here), or '
         'unscaled',
     )
+    relabel_steps: int = Field(
+        0,
+        ge=0,
+        le=10**9,
+        description='steps of the memory that are labelled again in a phase, whole segments with '
+        'the oldest labels first, one at least; what is new is always labelled; 0: all',
+    )
     record_relabels: Literal['first', 'all'] = Field(
         'first',
         description='labels in the bag: the first of each segment and all at evaluations, or '

@@ -1,12 +1,15 @@
 """The steps and segments of one source: where the memory D keeps its arrays."""
 
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from codetr_ros.records import F32, F64, Transitions
+
+COLUMNS = ('rows', 'lengths', 'offsets', 'episodes', 'values')
+"""What is known of each scored segment."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -23,14 +26,13 @@ class Rollout:
 
 @dataclass(slots=True)
 class Episode:
-    """Where an episode's steps lie, and which of its segments are scored."""
+    """Where an episode's steps lie."""
 
     number: int
     start: int  # row of its first step
     order: int  # episodes leave the memory in the order in which they came
     steps: int = 0
     ended: bool = False
-    scored: dict[int, int] = field(default_factory=dict)  # first step -> segment number
 
 
 class SourceRing:
@@ -57,20 +59,36 @@ class SourceRing:
         # kept when it is evicted: the next steps follow on it
         self.newest: Episode | None = None
         self.by_number: dict[int, Episode] = {}
-        # segments, grown by doubling; number n lies at n - first_segment
+        # segments, grown by a quarter; number n lies at n - first_segment
         self.first_segment = 0
         self.segments = 0
         self.segment_rows = np.empty(64, np.int64)
-        self.segment_lengths = np.empty(64, np.int64)
-        self.segment_offsets = np.empty(64, np.int64)  # first step within the episode
-        self.segment_episodes = np.empty(64, np.int64)
+        self.segment_lengths = np.empty(64, np.int32)
+        self.segment_offsets = np.empty(64, np.uint32)  # first step within the episode
+        self.segment_episodes = np.empty(64, np.uint32)
         self.segment_values = np.empty(64, np.float64)
         self.alive = np.empty(64, np.bool_)
+        # of each slot: 1 + the number of the segment that begins there, or 0; takes memory only
+        # where there are scores
+        self._beginning = np.zeros(capacity, np.uint32)
 
     @property
     def steps(self) -> int:
         """Steps held."""
         return self.end - self.start
+
+    @property
+    def segments_nbytes(self) -> int:
+        """Bytes of what is known of scored segments."""
+        table = [getattr(self, f'segment_{name}') for name in COLUMNS]
+        each: int = sum(column.itemsize for column in table) + self.alive.itemsize
+        rows = min(self.end, self.capacity) if self.segments else 0
+        return self.segments * each + rows * 4
+
+    def segment_from(self, row: int) -> int | None:
+        """The number of the scored segment whose first step lies in a row that is held."""
+        number = int(self._beginning[row % self.capacity])
+        return number - 1 if number else None
 
     def append(self, chunk: Transitions, episode: Episode) -> None:
         """Add steps that follow on those of the episode."""
@@ -130,7 +148,7 @@ class SourceRing:
     def add_segment(self, row: int, length: int, offset: int, episode: int, value: float) -> int:
         """Add a scored segment; its number."""
         at = self.segments
-        for name in ('rows', 'lengths', 'offsets', 'episodes', 'values'):
+        for name in COLUMNS:
             self._grow(f'segment_{name}', at)
         self._grow('alive', at)
         self.segment_rows[at], self.segment_lengths[at], self.segment_offsets[at] = (
@@ -140,23 +158,27 @@ class SourceRing:
         )
         self.segment_episodes[at], self.segment_values[at], self.alive[at] = episode, value, True
         self.segments += 1
+        self._beginning[row % self.capacity] = self.first_segment + at + 1
         return self.first_segment + at
 
     def _grow(self, name: str, needed: int) -> None:
         array = getattr(self, name)
         if needed >= len(array):
-            setattr(self, name, np.concatenate([array, np.empty_like(array)]))
+            more = np.empty(max(64, len(array) // 4), array.dtype)
+            setattr(self, name, np.concatenate([array, more]))
 
     def _drop_segments(self, episode: Episode) -> None:
-        for number in episode.scored.values():
-            self.alive[number - self.first_segment] = False
+        slots = np.arange(episode.start, episode.start + episode.steps) % self.capacity
+        numbers = self._beginning[slots].astype(np.int64)
+        self.alive[numbers[numbers > 0] - 1 - self.first_segment] = False
+        self._beginning[slots] = 0
         dead = (
             int(np.argmax(self.alive[: self.segments]))
             if self.alive[: self.segments].any()
             else self.segments
         )
         if dead > self.segments // 2 and dead >= 64:
-            for name in ('rows', 'lengths', 'offsets', 'episodes', 'values'):
+            for name in COLUMNS:
                 array = getattr(self, f'segment_{name}')
                 array[: self.segments - dead] = array[dead : self.segments].copy()
             self.alive[: self.segments - dead] = self.alive[dead : self.segments].copy()

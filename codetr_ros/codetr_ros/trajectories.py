@@ -5,7 +5,7 @@ Both the reward side and the learner keep one. Each observation is stored once; 
 wrong record is refused and changes nothing.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,8 +23,11 @@ from codetr_ros.records import (
 )
 from codetr_ros.source_ring import Episode, Rollout, SourceRing
 
+Slots = NDArray[np.uint32] | NDArray[np.int64]
 _SOURCE_SHIFT = 40
 """A segment id is (source index << 40) | number of the segment within its source."""
+_PART_ROWS = 1 << 16
+"""Rows that are looked at in double precision at a time."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -99,7 +102,7 @@ class Trajectories:
         self._regular = regular
         self._sources: dict[str, SourceRing] = {}
         self._order = 0
-        self._sampleable: tuple[NDArray[np.int64], list[SourceRing]] | None = None
+        self._sampleable: tuple[Slots, list[SourceRing]] | None = None
         self._ids: I64 | None = None
 
     # ------------------------------------------------------------------------------------------
@@ -194,17 +197,12 @@ class Trajectories:
                 f'{named}: there is no such segment. {fault}; this episode has {episode.steps} '
                 f'steps{ended}'
             )
-        if reward.first_step in episode.scored:
+        first = episode.start + reward.first_step
+        if source.segment_from(first) is not None:
             raise RecordError(
                 f'{named}: the segment has its composite reward already; the first one is kept'
             )
-        episode.scored[reward.first_step] = source.add_segment(
-            episode.start + reward.first_step,
-            reward.length,
-            reward.first_step,
-            reward.episode,
-            reward.value,
-        )
+        source.add_segment(first, reward.length, reward.first_step, reward.episode, reward.value)
         self._ids = None
 
     def _off_grid(self, reward: CompositeReward, episode: Episode) -> str | None:
@@ -319,7 +317,7 @@ class Trajectories:
         total = 0
         for s in self._sources.values():
             total += min(s.end, s.capacity) * self.bytes_per_step
-            total += len(s.finals) * 4 * self.observation_size + s.segments * 41
+            total += len(s.finals) * 4 * self.observation_size + s.segments_nbytes
         return total
 
     def report(self) -> dict[str, int]:
@@ -347,7 +345,7 @@ class Trajectories:
         slots, sources = self._labelled()
         if not len(slots):
             raise ValueError('no step of the memory is labelled: nothing to sample')
-        drawn = slots[rng.integers(0, len(slots), batch)]
+        drawn = slots[rng.integers(0, len(slots), batch)].astype(np.int64)
         if len(sources) == 1:
             return self._steps(sources[0], drawn)
         width = self.capacity + self._margin
@@ -366,7 +364,7 @@ class Trajectories:
                 getattr(result, name)[mine] = getattr(some, name)
         return result
 
-    def _labelled(self) -> tuple[NDArray[np.int64], list[SourceRing]]:
+    def _labelled(self) -> tuple[Slots, list[SourceRing]]:
         if self._sampleable is None:
             sources = [self._sources[name] for name in sorted(self._sources)]
             width = self.capacity + self._margin
@@ -374,7 +372,9 @@ class Trajectories:
                 np.flatnonzero(np.isfinite(s.labels[: min(s.end, s.capacity)])) + i * width
                 for i, s in enumerate(sources)
             ]
-            self._sampleable = (np.concatenate(parts) if parts else np.empty(0, np.int64), sources)
+            slots = np.concatenate(parts) if parts else np.empty(0, np.int64)
+            small = len(sources) * width <= 2**32
+            self._sampleable = (slots.astype(np.uint32) if small else slots, sources)
         return self._sampleable
 
     @staticmethod
@@ -438,11 +438,11 @@ class Trajectories:
         found = [ids[i : i + 1] for i in range(len(ids))]
         for index, source, mine, at in self._by_source(ids):
             for i, place in zip(mine.tolist(), at.tolist(), strict=True):
-                scored = source.by_number[int(source.segment_episodes[place])].scored
-                first = int(source.segment_offsets[place])
+                row, first = int(source.segment_rows[place]), int(source.segment_offsets[place])
                 run: list[int] = []
                 while len(run) < longest - 1:
-                    number = scored.get(first - (len(run) + 1) * self.delay)
+                    back = (len(run) + 1) * self.delay
+                    number = source.segment_from(row - back) if back <= first else None
                     if number is None:
                         break
                     if source.segment_lengths[number - source.first_segment] < self.delay:
@@ -489,9 +489,9 @@ class Trajectories:
         return [
             (
                 source.name,
-                source.segment_episodes[at],
-                source.segment_offsets[at],
-                source.segment_lengths[at],
+                source.segment_episodes[at].astype(np.int64),
+                source.segment_offsets[at].astype(np.int64),
+                source.segment_lengths[at].astype(np.int64),
             )
             for _, source, _, at in self._by_source(ids)
         ]
@@ -534,15 +534,18 @@ class Trajectories:
         """Mean and standard deviation of each observation component over all steps held, in
         float64.
         """
-        parts = [
-            s.observations[np.arange(s.start, s.end) % s.capacity]
-            for s in self._sources.values()
-            if s.steps
-        ]
-        if not parts:
+        if not self.steps:
             return np.zeros(self.observation_size), np.ones(self.observation_size)
-        rows = np.concatenate(parts).astype(np.float64)
-        return rows.mean(0), rows.std(0)
+        mean = _sum(self._observations()) / self.steps
+        squares = _sum((rows - mean) ** 2 for rows in self._observations())
+        return mean, np.sqrt(squares / self.steps)
+
+    def _observations(self) -> Iterator[F64]:
+        """The observations of all steps held, part by part: (rows, O)."""
+        for source in self._sources.values():
+            for first in range(source.start, source.end, _PART_ROWS):
+                rows = np.arange(first, min(first + _PART_ROWS, source.end))
+                yield source.observations[rows % source.capacity].astype(np.float64)
 
     def _by_source(self, ids: I64) -> Iterator[tuple[int, SourceRing, NDArray[np.int64], I64]]:
         names = sorted(self._sources)
@@ -588,6 +591,16 @@ class Trajectories:
                 known[~inside[mine][:, 1:]] = 0
                 rewards[mine] = known
         return SegmentBatch(observations, actions, lengths, context, values, rewards)
+
+
+def _sum(parts: Iterable[F64]) -> F64:
+    """The sum of all rows, one after the other, as if the parts were one array."""
+    total: F64 | None = None
+    for part in parts:
+        rows = part if total is None else np.concatenate([total[None], part])
+        total = rows.sum(0)
+    assert total is not None
+    return total
 
 
 def _ranges(starts: I64, lengths: I64) -> I64:

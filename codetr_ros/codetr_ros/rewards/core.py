@@ -25,6 +25,7 @@ from codetr_ros.records import (
     TrueRewards,
 )
 from codetr_ros.rewards import saved
+from codetr_ros.rewards.ages import LabelAges
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.trajectories import Trajectories
 
@@ -73,8 +74,7 @@ class Labeller(Consumer):
         super().__init__(run, settings, name, folder, scores=True, true_rewards=oracle)
         self._method: rewards.RewardMethod | None = None
         self._fitted = False
-        self._labelled_version = -1
-        self._labelled = np.empty(0, np.int64)  # ids that have their first label
+        self._ages = LabelAges()
 
     @property
     def method(self) -> rewards.RewardMethod | None:
@@ -112,7 +112,9 @@ class Labeller(Consumer):
         for batch in self._label(phase, memory, method):
             parts += batch
             yield []
+        metrics |= self._ages.metrics(method.version, memory.lengths)
         metrics |= {
+            'steps_labelled': sum(len(part.labels) for part in parts),
             'target_scale': method.target_scale,
             'gradient_steps': method.gradient_steps,
             'label_seconds': time.perf_counter() - began,
@@ -145,10 +147,12 @@ class Labeller(Consumer):
     def _label(
         self, phase: int, memory: Trajectories, method: rewards.RewardMethod
     ) -> Iterator[list[StepRewards]]:
-        """Label what is new or has changed; a slice is one forward pass."""
-        ids = memory.segment_ids()
-        fresh = np.setdiff1d(ids, self._labelled, assume_unique=True)
-        todo = fresh if method.version == self._labelled_version else ids
+        """Label what is new, and of what has changed as much as `relabel_steps` says.
+
+        A slice is one forward pass.
+        """
+        self._ages.follow(memory.segment_ids())
+        todo = self._ages.due(method.version, memory.lengths, self._settings.relabel_steps)
         for i in range(0, len(todo), method.label_batch):
             some = todo[i : i + method.label_batch]
             passes = []
@@ -162,8 +166,8 @@ class Labeller(Consumer):
                     f'{method.gradient_steps} gradient steps: training has diverged. '
                     'Lower its learning_rate, or set target_scale=rms'
                 )
+            self._ages.label(some, method.version)
             yield self._records(phase, memory, some, joined, method.version)
-        self._labelled, self._labelled_version = ids, method.version
 
     def _records(
         self, phase: int, memory: Trajectories, ids: I64, labels: F32, version: int
