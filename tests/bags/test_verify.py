@@ -1,12 +1,15 @@
 import json
 import os
 import re
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from bags.making import WRITERS, a_run, ours
 
+from codetr_ros.bags.episodes import SourceChecks
+from codetr_ros.bags.findings import Findings
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.verify import verify
 from codetr_ros.cli import main
@@ -357,3 +360,27 @@ def test_a_row_of_a_compressed_database_is_named_as_one(tmp_path):
     bag = WRITERS['rosbags-sqlite-zstd-file'](tmp_path / 'bag', a_run())
     entry = next(Bag(bag).entries())
     assert str(entry.place).endswith('bag.db3.zstd row 1')
+
+
+def test_a_bag_without_true_rewards_and_commits_takes_no_memory_for_each_chunk():
+    """A robot's bag: nothing is to be compared with its steps."""
+    source = SourceChecks('sim', None, Findings())
+    chunk = next(record for record in RUN if isinstance(record, Transitions))
+
+    def send(numbers):
+        for n in numbers:
+            source.transitions(replace(chunk, sequence=n, first_step=chunk.steps * n), 'place')
+
+    tracemalloc.start()
+    try:
+        send(range(11_000))
+        before = tracemalloc.get_traced_memory()[0]
+        send(range(11_000, 25_000))
+        assert tracemalloc.get_traced_memory()[0] < 1.2 * before
+    finally:
+        tracemalloc.stop()
+
+
+def test_true_rewards_that_come_behind_the_commits_are_no_fault(tmp_path):
+    late = sorted(RUN, key=lambda record: isinstance(record, TrueRewards))
+    assert verify(ours(tmp_path / 'bag', late)).sound

@@ -4,6 +4,7 @@ Memory: twelve bytes for each episode, and whatever still waits for its counterp
 """
 
 from array import array
+from collections import OrderedDict
 from collections.abc import Iterator
 from typing import Any
 
@@ -22,6 +23,7 @@ from codetr_ros.records import (
 
 _MOST_SKIPPED = 1_000_000  # episodes
 _MOST_EARLY = 10_000  # scores
+_MOST_AHEAD = 10_000  # chunks of which true rewards may come, where none have come yet
 _U32 = 2**32 - 1
 Span = tuple[int, int, int]
 """Episode, first step, length."""
@@ -86,9 +88,12 @@ class SourceChecks:
         self._early: list[
             tuple[CompositeReward, Any]
         ] = []  # scores of steps that are not here yet
-        self._chunks: dict[int, Span] = {}  # of which the true rewards have not come
+        self._chunks: OrderedDict[int, Span] = (
+            OrderedDict()
+        )  # of which the true rewards have not come
         self._true: dict[int, tuple[Span, Any]] = {}  # true rewards whose chunk has not come
         self._has_true = False
+        self._passed = -1  # chunks up to this number: true rewards of them are not compared
 
     def transitions(self, chunk: Transitions, place: Any) -> None:
         """Check the next steps."""
@@ -105,6 +110,8 @@ class SourceChecks:
             self._compare(span, *self._true.pop(chunk.sequence))
         else:
             self._chunks[chunk.sequence] = span
+            if not self._has_true and len(self._chunks) > _MOST_AHEAD:
+                self._passed, _ = self._chunks.popitem(last=False)
         early, self._early = self._early, []
         for reward, where in early:
             self.score(reward, where)
@@ -200,7 +207,7 @@ class SourceChecks:
         span = record.episode, record.first_step, len(record.rewards)
         if record.sequence in self._chunks:
             self._compare(self._chunks.pop(record.sequence), span, place)
-        else:
+        elif record.sequence > self._passed:
             self._true[record.sequence] = span, place
 
     def _compare(self, chunk: Span, true: Span, place: Any) -> None:
@@ -218,6 +225,7 @@ class SourceChecks:
         if not self._has_true:
             for sequence in [n for n in self._chunks if n <= last]:
                 del self._chunks[sequence]
+            self._passed = max(self._passed, last)
 
     def labelled(self, span: Span) -> bool:
         """Whether these steps are there."""
