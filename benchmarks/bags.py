@@ -1,4 +1,5 @@
-"""How fast are bags recorded, verified, recovered and read, against rosbags in the same call?
+"""How fast are bags recorded, verified, recovered, read and played, against rosbags in the same
+call?
 
     .venv/bin/python benchmarks/bags.py --out benchmarks/results/bags
 
@@ -17,10 +18,15 @@ messages are encoded before the clock starts; what is timed:
   verify            everything that `codetr bag verify` compares
   recover           a bag whose index and last bytes are gone to a whole one, verified
   info              what `codetr bag info` counts
+  play              `codetr bag play` to a live reward node, from the first commit played to the
+                    last phase handled. Its method is `uniform`, which learns nothing, and it has
+                    no folder for checkpoints, each of which waits for the disk: what takes time
+                    is to read, publish, take in and label. Skipped where there is no ROS
 
 MB are those of the messages' bytes. Each is done once, one after the other, in one process, the
-files in the page cache as the writers left them. Rates are by the clock; `cpu_s` is what the
-process itself worked, which other work on the machine changes less.
+files in the page cache as the writers left them; playing takes two more. Rates are by the clock;
+`cpu_s` is what the process itself worked (playing: player and reward node), which other work on
+the machine changes less.
 """
 
 import argparse
@@ -38,6 +44,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 
+import bag_playing
 import machine
 from codetr_ros.bags.definitions import encode, own_types
 from codetr_ros.bags.info import survey
@@ -46,7 +53,7 @@ from codetr_ros.bags.recover import recover
 from codetr_ros.bags.topics import BagTopic
 from codetr_ros.bags.verify import verify
 from codetr_ros.bags.writer import McapWriter
-from codetr_ros.config import load
+from codetr_ros.config import Settings, load
 from codetr_ros.received import type_name
 from codetr_ros.records import (
     PROTOCOL_VERSION,
@@ -65,10 +72,16 @@ PHASE, CHUNK, DELAY, ACTIONS = 1000, 500, 25, 8
 COLUMNS = ('what', 'by', 'observations', 'steps', 'seconds', 'cpu_s', 'steps_per_s', 'MB_per_s')
 
 
+def settings_of(steps: int) -> Settings:
+    """Of the run. Its reward node learns nothing, so that playing is not hidden by learning."""
+    about = {'steps': steps, 'delay': DELAY, 'task': 'Ant-v5', 'method': 'uniform'}
+    return load('cpu').changed(about)
+
+
 def a_run(steps: int, observations: int) -> Iterator[list[Record]]:
     """What is recorded up to each commit, one phase after the other."""
     rng = np.random.default_rng(0)
-    settings = load('cpu').changed({'steps': steps, 'delay': DELAY, 'task': 'Ant-v5'})
+    settings = settings_of(steps)
     task = TaskSpec(
         'run', PROTOCOL_VERSION, 'sim', 'Ant-v5', observations, ACTIONS, PHASE, 0.05, 1.0
     )
@@ -244,6 +257,12 @@ def measure(steps: int, observations: int, folder: Path) -> Iterator[dict[str, A
     yield timed('verify', 'ours', lambda: check_sound(ours))
     cut = cut_short(ours, folder / 'cut')
     yield timed('recover', 'ours', lambda: recover(cut, folder / 'recovered'))
+    if bag_playing.available():
+        watch = Stopwatch()
+        watch.seconds, watch.cpu = bag_playing.play(ours, settings_of(steps), folder)
+        yield row('play', 'ours, to a reward node', watch)
+    else:
+        print('play: skipped, rclpy is not here')
 
 
 def consume(folder: Path) -> int:

@@ -64,6 +64,7 @@ def test_a_phase_that_a_node_lacks_is_sent_again(ros_domain, tmp_path):
     report = run_folder.read_report(run_folder.report_path(tmp_path, 'reward', 'reward'))
     assert report['fetched'] == {'transitions': 4}
     assert '/r/reward lacks something of phase 0: sending it again' in said
+    assert said.index('phase 0 is played') < said.index('everything is played and learnt from')
 
 
 GONE = [

@@ -71,6 +71,7 @@ class PlayNode(Played, CoreNode):
         self._others: list[PlayedRole] = []
         self._links: dict[tuple[str, str], Link] = {('record', ''): self.link}
         self._said_at = 0.0
+        self._done = False
         self.played: Counter[str] = Counter()
         self.left = 0  # messages of roles that are live
 
@@ -217,6 +218,10 @@ class PlayNode(Played, CoreNode):
         Raises:
             NodeError: somebody has not, and is silent.
         """
+        if not self._done:
+            self._done = True
+            learnt = ' and learnt from' if self._live else ''
+            self.log.info(f'everything is played{learnt}')
         left = [peer for peer in self._audience() if not peer.said.finished]
         deadline = self.values['peer_deadline']
         for peer in left:

@@ -1,0 +1,84 @@
+"""How fast `codetr bag play` is, with a live reward node whose method learns nothing: a part of
+`bags.py`.
+"""
+
+import importlib.util
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterable
+from pathlib import Path
+
+from codetr_ros import launcher
+from codetr_ros.config import Settings
+
+BEGUN, LEARNT = 'phase 0 is played', 'everything is played and learnt from'
+"""What the player says at the first commit, and when its last phase has been handled."""
+
+
+def available() -> bool:
+    """Whether there is ROS to play with."""
+    return importlib.util.find_spec('rclpy') is not None
+
+
+def cpu_seconds(processes: Iterable[int]) -> float:
+    """CPU seconds that processes have used so far, all together."""
+    ticks = 0
+    for number in processes:
+        stat = Path(f'/proc/{number}/stat').read_text()
+        ticks += sum(map(int, stat.rpartition(')')[2].split()[11:13]))  # user, system
+    return ticks / os.sysconf('SC_CLK_TCK')
+
+
+def play(bag: Path, settings: Settings, logs: Path) -> tuple[float, float]:
+    """Play a bag to a reward node of its own.
+
+    Args:
+        bag: the bag.
+        settings: of its run.
+        logs: folder for the reward node's log.
+
+    Returns:
+        Seconds, and CPU seconds of both processes, from the first commit played to the last phase
+        handled; starting is not among them.
+    """
+    namespace = f'/bench_{os.getpid()}'
+    environment = launcher.environment(settings)
+    reward = launcher.Command(
+        'reward',
+        'reward',
+        (str(launcher.executable('reward')), '--ros-args', '-r', f'__ns:={namespace}'),
+    )
+    command = [sys.executable, '-m', 'codetr_ros.cli', 'bag', 'play', str(bag)]
+    with launcher.Processes(print) as processes:
+        processes.start([reward], logs, environment)
+        with subprocess.Popen(
+            [*command, '--namespace', namespace],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=environment,
+        ) as player:
+            both = player.pid, processes.nodes[0].process.pid
+            spent, said = _watch(player, both)
+            code = player.wait()
+        heard = (logs / 'reward.log').read_text()
+        if code or len(spent) != 2 or 'refused' in heard or 'incomplete' in heard:
+            raise SystemExit(f'not everything was played and taken in:\n{"".join(said)}{heard}')
+        processes.nodes[0].process.wait(launcher.STOP_DEADLINE)
+    (began, cpu), (ended, cpu_then) = spent
+    return ended - began, cpu_then - cpu
+
+
+def _watch(
+    player: 'subprocess.Popen[str]', both: tuple[int, int]
+) -> tuple[list[tuple[float, float]], list[str]]:
+    """The clock and the CPU seconds when the player says one or the other; all that it said."""
+    spent, said = [], []
+    assert player.stdout
+    for line in player.stdout:
+        said.append(line)
+        if BEGUN in line or LEARNT in line:
+            spent.append((time.perf_counter(), cpu_seconds(both)))
+    return spent, said
