@@ -50,6 +50,8 @@ def test_the_papers_table_is_what_the_paper_preset_says() -> None:
         ('steps', -5, 'steps = -5: Input should be greater than or equal to 1'),
         ('method', 'magic', "method = 'magic': Input should be 'codetr', 'none', 'rbt', 'rrd'"),
         ('composite', 'mean', "composite = 'mean': Input should be 'sum'"),
+        ('envs', 0, 'envs = 0: Input should be greater than or equal to 1'),
+        ('envs', 65, 'envs = 65: Input should be less than or equal to 64'),
         ('sac.discount', 1.5, 'sac.discount = 1.5: Input should be less than or equal to 1'),
         ('sac.hidden', (64, -1, 64), 'sac.hidden'),
         ('beta', math.inf, 'beta = inf: Input should be'),
@@ -216,3 +218,17 @@ def test_evaluations_of_the_quick_preset_come_every_3000_steps() -> None:
         12_000,
         15_000,
     ]
+
+
+def test_the_sources_of_a_run_are_the_environments_of_its_simulators() -> None:
+    one = config.load('quick').changed({'simulators': 2})
+    assert [one.sources_of(name) for name in one.simulator_names] == [('sim',), ('sim_2',)]
+    many = one.changed({'envs': 3})
+    sources = [source for name in many.simulator_names for source in many.sources_of(name)]
+    assert sources == ['sim-1', 'sim-2', 'sim-3', 'sim_2-1', 'sim_2-2', 'sim_2-3']
+    assert [many.simulator_of(source) for source in sources] == ['sim'] * 3 + ['sim_2'] * 3
+    assert one.simulator_of('a-1') == 'a-1'  # a robot may be called so
+    for settings in (one, many):
+        assert len(settings.shares_of(0)) == settings.source_count == 2 * settings.envs
+        assert sum(settings.shares_of(0)) == settings.phase_steps
+    assert many.shares_of(0) == [167, 167, 167, 167, 166, 166]

@@ -339,6 +339,13 @@ class Settings(Group):
     simulators: int = Field(
         1, ge=1, le=64, description='simulators among whom the steps of a phase are divided'
     )
+    envs: int = Field(
+        1,
+        ge=1,
+        le=64,
+        description='environments of each simulator, among which its steps are divided; they are '
+        'stepped in threads, as many as there are processors',
+    )
     memory_steps: int = Field(
         1_000_000, ge=1, le=10**9, description='steps that the memory D holds'
     )
@@ -435,15 +442,15 @@ class Settings(Group):
         return 2 if self.overlap else 1
 
     def steps_of(self, phase: int) -> int:
-        """Environment steps of a phase, all simulators together; 0 beyond the last."""
+        """Environment steps of a phase, all sources together; 0 beyond the last."""
         return max(0, min(self.phase_steps, self.steps - phase * self.phase_steps))
 
     def shares_of(self, phase: int) -> list[int]:
-        """Steps that each simulator takes of a phase: the first ones take one more where it does
-        not divide.
+        """Steps that each source takes of a phase: the first ones take one more where it does not
+        divide.
         """
-        share, rest = divmod(self.steps_of(phase), self.simulators)
-        return [share + (i < rest) for i in range(self.simulators)]
+        share, rest = divmod(self.steps_of(phase), self.source_count)
+        return [share + (i < rest) for i in range(self.source_count)]
 
     def steps_after(self, version: int) -> int:
         """Environment steps that policy version `version` has learnt from."""
@@ -478,9 +485,26 @@ class Settings(Group):
         return RunSpec(run_id, PROTOCOL_VERSION, self.seed, self.canonical(), self.hash())
 
     @property
-    def sources(self) -> tuple[str, ...]:
+    def simulator_names(self) -> tuple[str, ...]:
         """Names that `codetr train` gives the run's simulators: sim, sim_2, sim_3, ..."""
         return ('sim', *(f'sim_{i}' for i in range(2, self.simulators + 1)))
+
+    @property
+    def source_count(self) -> int:
+        """Sources of the run: environments of all simulators."""
+        return self.simulators * self.envs
+
+    def sources_of(self, simulator: str) -> tuple[str, ...]:
+        """Names of a simulator's sources: its own where it has one environment; sim-1, sim-2, ...
+        where it has several.
+        """
+        if self.envs == 1:
+            return (simulator,)
+        return tuple(f'{simulator}-{i}' for i in range(1, self.envs + 1))
+
+    def simulator_of(self, source: str) -> str:
+        """The simulator whose source it is. No node's name has a hyphen."""
+        return source if self.envs == 1 else source.rpartition('-')[0]
 
     def flat(self) -> dict[str, Any]:
         """Every setting by its dotted name, as ROS parameters and errors call it."""

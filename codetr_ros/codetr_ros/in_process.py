@@ -2,6 +2,8 @@
 process.
 
 With the same seed, pace and thread count a run over topics ends with the same weights as this one.
+Everything takes its turn here, so that evaluation, too, makes the run longer by the time that it
+takes; over topics no phase waits for it.
 """
 
 import logging
@@ -77,7 +79,7 @@ def run(
     spec = settings.run_spec(run_id)
     checkpoints = folder / run_folder.CHECKPOINTS if folder else None
     cores: dict[str, tuple[str, Core]] = {
-        name: ('sim', Simulator(spec, settings, name)) for name in settings.sources
+        name: ('sim', Simulator(spec, settings, name)) for name in settings.simulator_names
     }
     cores['record'] = ('record', Recorder(spec, settings, 'record'))
     if settings.labels_steps:

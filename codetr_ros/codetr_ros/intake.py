@@ -43,28 +43,28 @@ def check_run(record: Record, run: RunSpec) -> None:
 
 
 class Tasks:
-    """The simulators of a run and what they simulate."""
+    """The sources of a run and what they simulate."""
 
     def __init__(self, run: RunSpec, settings: Settings) -> None:
         self._run = run
-        self._expected = settings.simulators
+        self._settings = settings
         self.specs: dict[str, TaskSpec] = {}
         self._unannounced: list[Transitions] = []
         self.refused: Counter[str] = Counter()  # of what waited for its announcement
 
     @property
     def known(self) -> bool:
-        """Whether all simulators of the run have said what they simulate."""
-        return len(self.specs) == self._expected
+        """Whether all sources of the run have said what they simulate."""
+        return len(self.specs) == self._settings.source_count
 
     @property
     def first(self) -> TaskSpec:
-        """The task, which all simulators share."""
+        """The task, which all sources share."""
         return self.specs[min(self.specs)]
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Names of the simulators, sorted."""
+        """Names of the sources, sorted."""
         return tuple(sorted(self.specs))
 
     def receive(self, spec: TaskSpec) -> None:
@@ -92,7 +92,7 @@ class Tasks:
         if spec.source not in self.specs and self.known:
             raise RecordError(
                 f'{spec.source!r} is one simulator too many: the run has '
-                f'simulators={self._expected} '
+                f'simulators={self._settings.simulators} with envs={self._settings.envs} each '
                 f'({", ".join(self.sources)}). Start the run with more, or stop this one'
             )
         self.specs[spec.source] = spec

@@ -87,7 +87,7 @@ def commands(
     Raises:
         LaunchError: an executable is missing.
     """
-    nodes = [(name, 'sim') for name in settings.sources]
+    nodes = [(name, 'sim') for name in settings.simulator_names]
     nodes += [(role, role) for role in settings.roles if role != 'sim']
     found = []
     for name, role in nodes:

@@ -55,7 +55,7 @@ class Presence:
 
     run_id: str
     role: str  # one of ROLES
-    node: str  # fully qualified node name; its last part is the source's name where role is 'sim'
+    node: str  # fully qualified node name; its last part names the sources where role is 'sim'
     instance_id: str  # another one after each start of the process
     settings_hash: str  # empty while the node still waits for the run
     finished: bool

@@ -75,7 +75,7 @@ class Recovery:
         """Take note of a record of the run, of whatever kind."""
         if isinstance(record, TrueRewards):
             if record.source not in self._sources:
-                share = self._settings.memory_steps // self._settings.simulators
+                share = self._settings.memory_steps // self._settings.source_count
                 self._sources[record.source] = _Source(max(1, share))
             self._sources[record.source].append(record)
         elif isinstance(record, StepRewards):

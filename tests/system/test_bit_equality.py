@@ -3,6 +3,7 @@ altered.
 """
 
 import itertools
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,6 +11,7 @@ from builders import tiny
 from system.runs import train
 
 from codetr_ros import in_process
+from codetr_ros.bags.verify import verify
 from codetr_ros.config import Settings
 from codetr_ros.summary import Summary
 
@@ -103,3 +105,14 @@ def test_two_simulators_over_topics_equal_two_in_process(tmp_path):
     settings = tiny(simulators=2, task=REACHER)
     topics, _ = train(settings, tmp_path / 'topics')
     check_same(topics, by_calls(settings))
+
+
+def test_several_environments_of_a_simulator_over_topics_equal_those_in_process(tmp_path):
+    settings = tiny(simulators=2, envs=2, overlap=True)
+    topics, _ = train(settings, tmp_path / 'topics')
+    check_same(topics, by_calls(settings))
+    assert topics['lost'] == topics['duplicated'] == topics['refused'] == 0
+    steps = [topics['counters'][f'sim-{name}']['steps'] for name in settings.simulator_names]
+    assert steps == [600, 600]
+    bag = verify(Path(topics['bag']))
+    assert bag.sound, bag.findings

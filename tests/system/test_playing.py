@@ -32,8 +32,10 @@ class Recorded:
 
 @pytest.fixture(scope='module')
 def recorded(tmp_path_factory):
-    """Overlap: two phases are under way at once. All labels, so that they can be played too."""
-    settings = tiny(overlap=True, record_relabels='all', evaluate_every=0)
+    """Overlap: two phases are under way at once. All labels, so that they can be played too. Two
+    environments: the simulator that is played speaks for two sources.
+    """
+    settings = tiny(overlap=True, record_relabels='all', evaluate_every=0, envs=2)
     folder = tmp_path_factory.mktemp('recorded') / 'run'
     with domain():
         summary, _ = train(settings, folder)

@@ -140,7 +140,7 @@ class Lirpg:
         settings, own = self._settings, self._settings.lirpg
         if phase < settings.warmup_phases:
             self.counters['steps not learnt from, acted at random'] += memory.steps
-            everything = memory.newest([memory.steps] * settings.simulators)
+            everything = memory.newest([memory.steps] * settings.source_count)
             self._observe(everything.observations)
             return
         began = time.perf_counter()

@@ -40,7 +40,7 @@ from codetr_ros.ros.signals import Stop
 LEARNERS = ('reward', 'learner')
 """Roles that learn from what is played, and that it waits for."""
 SAY_EVERY = 5.0  # [s] between two words on how far it is
-MUST_AGREE = ('task', 'composite', 'beta', 'delay', 'phase_steps', 'simulators')
+MUST_AGREE = ('task', 'composite', 'beta', 'delay', 'phase_steps', 'simulators', 'envs')
 """Settings under which the steps were made: a live learner must have the same."""
 
 
@@ -97,7 +97,8 @@ class PlayNode(Played, CoreNode):
                 f'the run has no node of role {", ".join(unknown)} (method '
                 f'{self.settings.method!r}): there is nobody to play to'
             )
-        wanted = [('sim', source) for source in self._recorded.sources]
+        simulators = dict.fromkeys(map(self._simulator_of, self._recorded.sources))
+        wanted = [('sim', name) for name in simulators]
         wanted += [(role, role) for role in ('reward', 'evaluate') if role in self.settings.roles]
         return all(self._play(role, name) for role, name in wanted if role not in self._live)
 
@@ -185,7 +186,10 @@ class PlayNode(Played, CoreNode):
         if role != 'sim':
             return role, ''
         # a person's score, too, goes out with the simulator whose segment it is
-        return 'sim', record.source
+        return 'sim', self._simulator_of(record.source)
+
+    def _simulator_of(self, source: str) -> str:
+        return self._recorded.settings.simulator_of(source)
 
     def _say(self, commit: Commit) -> None:
         now = time.monotonic()

@@ -4,19 +4,19 @@ Reliable everywhere. What a late joiner must still hear (`run`, `task`, `policy`
 transient local. Every queue is deeper than what the permitted phases can put on its topic:
 KEEP_LAST would drop the rest silently, and KEEP_ALL blocks the publisher. `max(FLOOR, MARGIN *
 most)` is the depth, where `most` is, for P = lag + 1 phases (one more than is ever permitted and
-not yet committed) of N = phase_steps steps, all simulators together:
+not yet committed) of N = phase_steps steps, all sources together:
 
     transitions, true_rewards   P * N                      a chunk has at least one step
     composite_rewards           P * N                      a segment has at least one step
     episodes                    P * N + evaluate_episodes  an episode has at least one step
-    step_rewards                P * (simulators + ceil(16 * memory_steps / 100 kB))
+    step_rewards                P * (sources + ceil(16 * memory_steps / 100 kB))
                                                            at most 4 bytes for each label and 12
                                                            for its segment, in parts of more than
                                                            half of 200 kB
     metrics                     P * (4 + simulators) * 4   a few from each node and phase
     policy                      P + ceil(4000 / N)         and those that come while an evaluation
     episode runs
-    commits, task               P; simulators
+    commits, task               P; sources
 
 A depth costs nothing by itself: the middleware keeps what has been published, not room for what
 might be.
@@ -55,13 +55,13 @@ def _steps(settings: Settings) -> int:
 QUALITIES: dict[str, Quality] = {
     'run': Quality(True, lambda s: 1),
     'presence': Quality(False, lambda s: 256),
-    'task': Quality(True, lambda s: s.simulators),
+    'task': Quality(True, lambda s: s.source_count),
     'policy': Quality(True, lambda s: _phases(s) + ceil(4000 / s.phase_steps)),
     'transitions': Quality(False, _steps),
     'composite_rewards': Quality(False, _steps),
     'commits': Quality(True, _phases),
     'step_rewards': Quality(
-        False, lambda s: _phases(s) * (s.simulators + ceil(16 * s.memory_steps / PART_BYTES))
+        False, lambda s: _phases(s) * (s.source_count + ceil(16 * s.memory_steps / PART_BYTES))
     ),
     'episodes': Quality(False, lambda s: _steps(s) + s.evaluate_episodes),
     'true_rewards': Quality(False, _steps),
