@@ -71,9 +71,9 @@ def compiled(function: _Function, example: Sequence[Any], without: str) -> _Func
         'fullgraph': True,
         'dynamic': False,
         'isolate_recompiles': True,  # as often as there are learners in this process
-        # One C++ file for all, the calls of matrix products included: it is built sooner than a
-        # file for each kernel, and Python has nothing left to do between them.
-        'options': {'cpp_wrapper': True},
+        # For a CPU one C++ file for all, the calls of matrix products included: it is built sooner
+        # than a file for each kernel, and Python has nothing left to do between them.
+        'options': {'cpp_wrapper': example[0].device.type == 'cpu'},
     }
     result = cast(_Function, torch.compile(function, **options))
     try:

@@ -382,6 +382,12 @@ class Settings(Group):
         'every one',
     )
     threads: int = Field(1, ge=1, le=256, description='torch threads of each process')
+    device: str = Field(
+        'cpu',
+        pattern=r'^(cpu|cuda(:\d{1,2})?)$',
+        description='where SAC learns: cpu, or the GPU cuda, cuda:1, ... of the learner; all else '
+        'runs on the CPU',
+    )
     codetr: CodetrSettings = Field(
         default_factory=CodetrSettings, description='the reward transformer'
     )
@@ -406,6 +412,15 @@ class Settings(Group):
             raise ValueError(
                 'overlap=True with method=lirpg: it learns on-policy, from steps under the very '
                 'policy that it changes; set overlap=False'
+            )
+        return self
+
+    @model_validator(mode='after')
+    def _a_gpu_has_a_use(self) -> 'Settings':
+        if self.device != 'cpu' and not self.labels_steps:
+            raise ValueError(
+                f'device={self.device} with method={self.method}: its policy learner runs on the '
+                'CPU only; set device=cpu'
             )
         return self
 

@@ -179,11 +179,10 @@ def torch() -> list[Check]:
     found = f'{module.__version__}, {module.get_num_threads()} threads on {cores} cores{said}'
     checks = [Check('torch', 'ok', f'{found} (`codetr train` sets its own: --threads)')]
     if module.cuda.is_available():
-        checks.append(
-            Check('GPU', 'ok', f'{module.cuda.get_device_name()}; training uses the CPU')
-        )
+        name = module.cuda.get_device_name()
+        checks.append(Check('GPU', 'ok', f'{name}; SAC learns on it with device=cuda'))
     else:
-        checks.append(Check('GPU', 'ok', 'none that torch can use; training uses the CPU'))
+        checks.append(Check('GPU', 'ok', 'none that torch can use; device=cpu needs none'))
     return checks
 
 

@@ -297,6 +297,11 @@ class Trajectories:
         return sum(s.steps for s in self._sources.values())
 
     @property
+    def sources(self) -> list[SourceRing]:
+        """Where each source's steps lie, in the order in which they sent the first of them."""
+        return list(self._sources.values())
+
+    @property
     def labelled_steps(self) -> int:
         """Steps that have a step reward."""
         return len(self._labelled()[0])
@@ -347,7 +352,7 @@ class Trajectories:
             raise ValueError('no step of the memory is labelled: nothing to sample')
         drawn = slots[rng.integers(0, len(slots), batch)].astype(np.int64)
         if len(sources) == 1:
-            return self._steps(sources[0], drawn)
+            return self.steps_in(sources[0], drawn)
         width = self.capacity + self._margin
         parts = np.empty((batch, self.observation_size), np.float32)
         result = StepBatch(
@@ -359,7 +364,7 @@ class Trajectories:
         )
         for index, source in enumerate(sources):
             mine = np.flatnonzero(drawn // width == index)
-            some = self._steps(source, drawn[mine] % width)
+            some = self.steps_in(source, drawn[mine] % width)
             for name in StepBatch.__dataclass_fields__:
                 getattr(result, name)[mine] = getattr(some, name)
         return result
@@ -378,7 +383,8 @@ class Trajectories:
         return self._sampleable
 
     @staticmethod
-    def _steps(source: SourceRing, slots: NDArray[np.int64]) -> StepBatch:
+    def steps_in(source: SourceRing, slots: NDArray[np.int64]) -> StepBatch:
+        """The steps that lie in some slots of a source; NaN for a reward that is not there."""
         following = source.observations.take((slots + 1) % source.capacity, 0)
         for i in np.flatnonzero(source.last[slots]):
             row = source.start + (int(slots[i]) - source.start) % source.capacity

@@ -12,6 +12,7 @@ from codetr_ros.config import Settings
 from codetr_ros.consumer import Consumer
 from codetr_ros.intake import check_run
 from codetr_ros.learners import methods, network
+from codetr_ros.learners.device_sac import usable
 from codetr_ros.learners.learner import PolicyLearner
 from codetr_ros.records import (
     INITIAL_VERSION,
@@ -38,12 +39,16 @@ class Learner(Consumer):
         settings: its settings.
         name: node name.
         folder: where checkpoints go; None keeps none.
+
+    Raises:
+        LearnerError: the device of the settings is not here.
     """
 
     role = 'learner'
     subscribes: tuple[type, ...] = (TaskSpec, Transitions, Commit, StepRewards)
 
     def __init__(self, run: RunSpec, settings: Settings, name: str, folder: Path | None) -> None:
+        usable(settings.device)  # a device that is not here is said at once
         if not settings.labels_steps:
             self.subscribes = (TaskSpec, Transitions, CompositeReward, Commit)
         super().__init__(run, settings, name, folder, scores=not settings.labels_steps)

@@ -34,7 +34,12 @@ class FlatSAC(SAC):
     """SAC with the fast update. The states of this form and of the plain one are the same."""
 
     def __init__(
-        self, observation_size: int, action_size: int, settings: SacSettings, seed: int
+        self,
+        observation_size: int,
+        action_size: int,
+        settings: SacSettings,
+        seed: int,
+        device: torch.device | str = 'cpu',
     ) -> None:
         """Make the networks: for the same arguments those of the plain form.
 
@@ -43,30 +48,36 @@ class FlatSAC(SAC):
             action_size: A.
             settings: widths, learning rates and the rest.
             seed: of the initial weights; torch's global generator is seeded from it.
+            device: where weights, moments and sums lie; the initial weights are the same anywhere.
         """
         super().__init__(observation_size, action_size, settings, seed)
         freed_memory.keep()
         self.batch = settings.batch
-        self.critic_adam = self._critic = FlatAdam(self.critic, settings.critic_learning_rate)
+        self.critic_adam = self._critic = FlatAdam(
+            self.critic, settings.critic_learning_rate, device
+        )
         self.actor_adam = self._actor = FlatAdam(
-            list(self.actor.parameters()), settings.actor_learning_rate
+            list(self.actor.parameters()), settings.actor_learning_rate, device
         )
         self.temperature_adam = self._temperature = FlatAdam(
-            [self.log_temperature], settings.temperature_learning_rate
+            [self.log_temperature], settings.temperature_learning_rate, device
         )
         self.critic_values = self._critic.views(self._critic.flat)
         self._flat_target = self._critic.flat.clone()
         self.target = self._critic.views(self._flat_target)
-        self._sums = torch.zeros(len(METRICS))
+        self._sums = torch.zeros(len(METRICS), device=device)
         self._step = self._update
         if settings.compile:
-            self._compile(observation_size, action_size)
+            self._compile(self._example(observation_size, action_size))
+
+    def _example(self, observation_size: int, action_size: int) -> tuple[Tensor, ...]:
+        """Arguments of `_update` that lie in memory as those of every update will."""
+        s, a = torch.zeros(self.batch, observation_size), torch.zeros(self.batch, action_size)
+        return s, a, s[:, 0].clone(), s, s[:, 0].clone(), torch.zeros(2, *a.shape)
 
     @torch.no_grad()
-    def _compile(self, observation_size: int, action_size: int) -> None:
+    def _compile(self, example: tuple[Tensor, ...]) -> None:
         """Have the update compiled, by one of which nothing remains."""
-        s, a = torch.zeros(self.batch, observation_size), torch.zeros(self.batch, action_size)
-        example = (s, a, s[:, 0].clone(), s, s[:, 0].clone(), torch.zeros(2, *a.shape))
         state = self.state()
         self._step = compiled(self._update, example, without='sac.compile=false')
         self.load_state(state)
@@ -191,11 +202,16 @@ class FlatAdam(Adam):
     and `square`.
     """
 
-    def __init__(self, parameters: Sequence[nn.Parameter], learning_rate: float) -> None:
+    def __init__(
+        self,
+        parameters: Sequence[nn.Parameter],
+        learning_rate: float,
+        device: torch.device | str = 'cpu',
+    ) -> None:
         super().__init__(parameters, learning_rate)
-        self.flat = torch.cat([p.detach().reshape(-1) for p in parameters])
+        self.flat = torch.cat([p.detach().reshape(-1) for p in parameters]).to(device)
         self.mean, self.square = torch.zeros_like(self.flat), torch.zeros_like(self.flat)
-        self.count = torch.zeros((), dtype=torch.float32)
+        self.count = torch.zeros((), dtype=torch.float32, device=device)
         self._shapes = [p.shape for p in parameters]
         for parameter, view in zip(parameters, self.views(self.flat), strict=True):
             parameter.data = view

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from codetr_ros.config import Settings
 from codetr_ros.learners import network
+from codetr_ros.learners.device_sac import DeviceSAC
 from codetr_ros.learners.flat_sac import FlatSAC
 from codetr_ros.learners.learner import OffPolicy
 from codetr_ros.trajectories import Trajectories
@@ -26,8 +27,12 @@ class FromLabels(OffPolicy):
 
     def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
         super().__init__(settings)
-        self._sac = FlatSAC(observation_size, action_size, settings.sac, settings.seed)
+        self._sac = self._make(observation_size, action_size)
         self.network = network.describe(observation_size, action_size, settings.sac.hidden)
+
+    def _make(self, observation_size: int, action_size: int) -> FlatSAC:
+        settings = self._settings
+        return FlatSAC(observation_size, action_size, settings.sac, settings.seed)
 
     @property
     def actor(self) -> network.Actor:
@@ -53,3 +58,23 @@ class FromLabels(OffPolicy):
             SacError: it is of another architecture; nothing has changed then.
         """
         self._sac.load_state(dict(state))
+
+
+class FromLabelsOnDevice(FromLabels):
+    """The same on the device of the settings, which draws the steps itself."""
+
+    _sac: DeviceSAC
+
+    def _make(self, observation_size: int, action_size: int) -> DeviceSAC:
+        settings = self._settings
+        return DeviceSAC(
+            observation_size, action_size, settings.sac, settings.seed, settings.device
+        )
+
+    def _prepare(self, memory: Trajectories) -> bool:
+        return self._sac.take(memory)
+
+    def _burst(
+        self, memory: Trajectories, rng: np.random.Generator, updates: int
+    ) -> dict[str, Tensor]:
+        return self._sac.replay(updates)

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from codetr_ros.config import Settings
-from codetr_ros.learners.from_labels import FromLabels
+from codetr_ros.learners.from_labels import FromLabels, FromLabelsOnDevice
 from codetr_ros.learners.hc import HC
 from codetr_ros.learners.learner import PolicyLearner
 from codetr_ros.learners.lirpg import Lirpg
@@ -20,6 +20,10 @@ def make(settings: Settings, observation_size: int, action_size: int) -> PolicyL
         settings: the run's settings.
         observation_size: O of the task.
         action_size: A of the task.
+
+    Raises:
+        LearnerError: the device of the settings is not here.
     """
-    learner = METHODS.get(settings.method, FromLabels)
+    from_labels = FromLabels if settings.device == 'cpu' else FromLabelsOnDevice
+    learner = METHODS.get(settings.method, from_labels)
     return learner(settings, observation_size, action_size)

@@ -109,8 +109,10 @@ class SAC:
         }
 
     def state(self) -> dict[str, Tensor]:
-        """All that the next update depends on but its batch and the generator: copies, by name."""
-        return {name: tensor.clone() for name, tensor in self._tensors().items()}
+        """All that the next update depends on but its batch and the generator: copies on the CPU,
+        by name.
+        """
+        return {name: tensor.to('cpu', copy=True) for name, tensor in self._tensors().items()}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Take over what `state` returned.

@@ -1,0 +1,149 @@
+"""SAC that learns where its memory is: on a GPU, without the host in between.
+
+An update is one CUDA graph, recorded once: the drawing of steps and noise, the targets, both
+losses, Adam, the temperature and the targets' step. The host only asks for replays, and waits for
+none: until a phase's metrics are fetched, it is ahead of the GPU. Between phases it copies what is
+new in the memory D.
+
+What differs from `FlatSAC`: which steps are drawn, and which noise, as they come from the device's
+generator. The update itself and the states are the same. On a CPU the same functions run, nothing
+being recorded. `sac.compile` compiles the update for the GPU before it is recorded.
+"""
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+import torch
+from torch import Tensor
+
+from codetr_ros.config import SacSettings
+from codetr_ros.learners.device_memory import DeviceMemory, columns
+from codetr_ros.learners.flat_sac import FlatSAC
+from codetr_ros.learners.learner import LearnerError
+from codetr_ros.trajectories import Trajectories
+
+Call: TypeAlias = Callable[[], None]
+WARM_UP_CALLS = 3
+"""Calls before the one that is recorded, for what libraries set up at the first ones."""
+
+
+class DeviceSAC(FlatSAC):
+    """SAC whose weights, moments and steps lie on a device.
+
+    Args:
+        observation_size: O.
+        action_size: A.
+        settings: widths, learning rates and the rest.
+        seed: of the initial weights; torch's global generators are seeded from it.
+        device: cpu, cuda, cuda:1, ...
+        record: makes of an update one that is faster and does the same. It may take updates
+            meanwhile, of which nothing remains. None: `cuda_graph` on a GPU, else nothing.
+
+    Raises:
+        LearnerError: there is no such device here.
+    """
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_size: int,
+        settings: SacSettings,
+        seed: int,
+        device: str,
+        record: Callable[[Call], Call] | None = None,
+    ) -> None:
+        self.device = usable(device)
+        with torch.accelerator.device_index(self.device.index):
+            super().__init__(observation_size, action_size, settings, seed, self.device)
+        self._record = record or (cuda_graph if self.device.type == 'cuda' else lambda call: call)
+        self._steps: DeviceMemory | None = None
+        self._recorded = self._sample_and_update
+
+    def _example(self, observation_size: int, action_size: int) -> tuple[Tensor, ...]:
+        width = 2 * observation_size + action_size + 2
+        rows = torch.zeros(self.batch, width, device=self.device)
+        noise = torch.zeros(2, self.batch, action_size, device=self.device)
+        return *columns(rows, observation_size, action_size), noise
+
+    def take(self, memory: Trajectories) -> bool:
+        """Bring what lies on the device up to date with the memory D.
+
+        The device's generator is used where an update is recorded: at the first labelled steps,
+        and when a source appears.
+
+        Returns:
+            Whether any step is labelled, so that `replay` may be called.
+        """
+        if not memory.labelled_steps:
+            return False
+        if self._steps is None or self._steps.memory is not memory:
+            self._steps = DeviceMemory(memory, self.discount, self.device)
+        with torch.accelerator.device_index(self.device.index):
+            if not self._steps.update():
+                state = self.state()
+                self._recorded = self._record(self._sample_and_update)
+                self.load_state(state)
+                self._sums.zero_()
+        return True
+
+    def replay(self, updates: int) -> dict[str, Tensor]:
+        """Updates in a row, from what was taken; on a GPU nobody waits for them.
+
+        Returns:
+            What `SAC.update` says, summed over the updates: scalars on the device.
+        """
+        with torch.accelerator.device_index(self.device.index):
+            for _ in range(updates):
+                self._recorded()
+            return self._said()
+
+    @torch.no_grad()
+    def _sample_and_update(self) -> None:
+        assert self._steps is not None, 'take a memory first'
+        s, a, r, s2, going_on = self._steps.read(self._steps.draw(self.batch))
+        noise = torch.randn(2, *a.shape, device=self.device)
+        self._step(s, a, r, s2, going_on, noise)
+
+
+def cuda_graph(call: Call) -> Call:
+    """Record what a call asks of the current GPU; the result asks for the same again.
+
+    It must read and write tensors that stay where they are, and wait for nothing. Random numbers
+    go on from one replay to the next: a graph knows the GPU's default generator, and a seed that
+    is set between two replays counts for the second.
+    """
+    stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        for _ in range(WARM_UP_CALLS):
+            call()
+    torch.cuda.current_stream().wait_stream(stream)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph, stream=stream):
+        call()
+    return graph.replay
+
+
+def usable(device: str) -> torch.device:
+    """A device by its name, once it is certain that torch can use it.
+
+    Raises:
+        LearnerError: it cannot; says why, and what to do.
+    """
+    wanted = torch.device(device)
+    if wanted.type == 'cpu':
+        return wanted
+    remedy = 'or set device=cpu'
+    if not torch.cuda.is_available():
+        if torch.version.cuda is None and torch.version.hip is None:
+            why, do = 'was built without CUDA', 'Install a build with it from pytorch.org'
+        else:
+            why, do = 'finds no GPU', 'See what nvidia-smi says and CUDA_VISIBLE_DEVICES hides'
+        raise LearnerError(f'device={device}: torch {torch.__version__} {why}. {do}, {remedy}')
+    count, index = torch.cuda.device_count(), wanted.index or 0
+    if index >= count:
+        raise LearnerError(
+            f'device={device}: torch finds {count} GPUs, the last is cuda:{count - 1}. '
+            f'Name one of them, {remedy}'
+        )
+    return torch.device('cuda', index)
