@@ -58,6 +58,8 @@ def test_the_papers_table_is_what_the_paper_preset_says() -> None:
         ('beta', math.nan, 'beta = nan: Input should be a finite number'),
         ('seed', 2**31, 'seed = 2147483648: Input should be less than or equal to 2147483647'),
         ('overlap', 'perhaps', "overlap = 'perhaps': Input should be a valid boolean"),
+        ('device', 'gpu', "device = 'gpu': String should match pattern"),
+        ('device', 'cuda:', "device = 'cuda:': String should match pattern"),
         ('codetr.heads', 5, 'embedding=64 is not divisible by heads=5'),
         ('task', '', "task = '': String should have at least 1 character"),
     ],
@@ -232,3 +234,10 @@ def test_the_sources_of_a_run_are_the_environments_of_its_simulators() -> None:
         assert len(settings.shares_of(0)) == settings.source_count == 2 * settings.envs
         assert sum(settings.shares_of(0)) == settings.phase_steps
     assert many.shares_of(0) == [167, 167, 167, 167, 166, 166]
+
+
+@pytest.mark.parametrize('method', config.SCORE_LEARNERS)
+def test_a_gpu_is_refused_where_the_policy_learner_has_no_use_for_it(method: str) -> None:
+    with pytest.raises(SettingsError, match=f'device=cuda with method={method}: .*device=cpu'):
+        settings(method=method, device='cuda')
+    assert settings(method='uniform', device='cuda:1').device == 'cuda:1'

@@ -1,0 +1,243 @@
+"""How fast does SAC learn on a GPU, and what is left of an update there?
+
+    .venv/bin/python benchmarks/sac_gpu.py
+
+Compared, for batches of 256 from a memory of a million labelled steps and networks of 256x256, of
+the sizes of Ant (27 or 105 observations, 8 actions) and HalfCheetah (17, 6):
+  - eager: the host asks for every operation of an update
+  - graph: the operations are recorded once and replayed (`device=cuda`, `sac.compile=false`)
+  - compiled graph: they are compiled before (`device=cuda`, `sac.compile=true`)
+
+A round goes through all of them in turn, with as many updates as `--updates` says, from the first
+call until the GPU has done the last of them. The table gives the median round, and the lowest and
+highest in brackets. `phase` is what the host does between two phases of 1000 steps: it copies what
+is new and all labels, and finds out which steps are labelled.
+
+A profile of some updates follows, by the time that kernels take on the GPU: how many kernels an
+update has, and which ones take longest.
+
+Without a GPU `--device cpu --steps 3000 --updates 3` shows that the script works: eager only, and
+with nothing to be learnt about a GPU.
+"""
+
+import argparse
+import csv
+import json
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch.autograd import DeviceType
+from torch.profiler import ProfilerActivity, profile
+
+import machine
+from codetr_ros.config import SacSettings
+from codetr_ros.learners.device_sac import DeviceSAC
+from codetr_ros.records import StepRewards, Transitions
+from codetr_ros.trajectories import Trajectories
+
+RESULTS = Path(__file__).parent / 'results' / 'sac_gpu'
+SIZES = {'Ant 27': (27, 8), 'Ant 105': (105, 8), 'HalfCheetah': (17, 6)}
+EPISODE, PHASE = 1000, 1000
+PROFILED = 50
+TOP = 15
+
+
+class Run:
+    """A memory of random steps to which phases are added."""
+
+    def __init__(self, sizes: tuple[int, int], steps: int) -> None:
+        self.memory = Trajectories(*sizes, EPISODE, steps, 2 * EPISODE)
+        self._sizes, self._rng, self._episode = sizes, np.random.default_rng(0), 0
+        while self.memory.steps < steps:
+            self.phase()
+        self.label()
+
+    def phase(self) -> None:
+        """One more episode; the oldest goes where the memory is full."""
+        O, A = self._sizes  # noqa: E741, N806
+        observations = self._rng.standard_normal((EPISODE + 1, O), np.float32)
+        actions = self._rng.uniform(-1, 1, (EPISODE, A)).astype(np.float32)
+        head = ('run', 'sim', self._episode, 0, self._episode, 0, EPISODE)
+        self.memory.append(Transitions(*head, observations, actions, False, True, True, 0))
+        self.memory.evict()
+        self._episode += 1
+
+    def label(self) -> None:
+        """New labels for every step."""
+        first = self._episode - self.memory.steps // EPISODE
+        numbers = np.arange(first, self._episode, dtype=np.uint32)
+        lengths = np.full(len(numbers), EPISODE, np.uint32)
+        labels = self._rng.standard_normal(self.memory.steps, np.float32)
+        segments = (numbers, np.zeros_like(numbers), lengths)
+        self.memory.apply(StepRewards('run', 0, 0, 0, 1, 'sim', *segments, labels))
+
+
+def forms(sizes: tuple[int, int], device: str, batch: int, width: int) -> dict[str, DeviceSAC]:
+    """The learners that are compared."""
+
+    def make(compiling: bool, **options: Any) -> DeviceSAC:
+        settings = SacSettings(hidden=(width, width), batch=batch, compile=compiling)
+        return DeviceSAC(*sizes, settings, 0, device, **options)
+
+    made = {'eager': make(False, record=lambda call: call)}
+    if device != 'cpu':
+        made |= {'graph': make(False), 'compiled graph': make(True)}
+    return made
+
+
+def seconds(call: Callable[[], object], device: str) -> float:
+    """Until the device has done what a call asks for."""
+
+    def wait() -> None:
+        if device != 'cpu':
+            torch.cuda.synchronize(device)
+
+    wait()
+    began = time.perf_counter()
+    call()
+    wait()
+    return time.perf_counter() - began
+
+
+def measure(task: str, arguments: argparse.Namespace) -> tuple[list[dict[str, Any]], str]:
+    """All rounds of one size, and the profiles."""
+    device, updates = arguments.device, arguments.updates
+    run = Run(SIZES[task], arguments.steps)
+    rows, profiles = [], []
+    made = forms(SIZES[task], device, arguments.batch, arguments.width)
+    first = {
+        name: seconds(lambda sac=sac: sac.take(run.memory), device) for name, sac in made.items()
+    }
+    for sac in made.values():
+        sac.replay(max(1, updates // 10))  # does not count
+    for n in range(arguments.rounds):
+        run.phase()
+        run.label()
+        for name, sac in made.items():
+            phase = seconds(lambda sac=sac: sac.take(run.memory), device)
+            took = seconds(lambda sac=sac: sac.replay(updates), device)
+            rows.append(
+                {'task': task, 'form': name, 'round': n, 'updates': updates}
+                | {'seconds': round(took, 5), 'phase_s': round(phase, 5)}
+                | {'first_s': round(first[name], 2)}
+            )
+    for name, sac in made.items():
+        profiles.append(f'### {task}, {name}\n\n{profiled(sac, device)}')
+    return rows, '\n\n'.join(profiles)
+
+
+def profiled(sac: DeviceSAC, device: str) -> str:
+    """What the device does for some updates: its kernels, the longest ones first."""
+    activities = [ProfilerActivity.CPU]
+    if device != 'cpu':
+        activities.append(ProfilerActivity.CUDA)
+    with profile(activities=activities) as found:
+        whole = seconds(lambda: sac.replay(PROFILED), device)
+    kind = DeviceType.CPU if device == 'cpu' else DeviceType.CUDA
+    time_of = 'self_cpu_time_total' if device == 'cpu' else 'self_device_time_total'
+    kernels = [event for event in found.key_averages() if event.device_type == kind]
+    kernels.sort(key=lambda event: -getattr(event, time_of))
+    busy = sum(getattr(event, time_of) for event in kernels) / PROFILED
+    calls = sum(event.count for event in kernels) / PROFILED
+    lines = [
+        f'{calls:.0f} kernels and copies an update, {busy:.0f} us of {1e6 * whole / PROFILED:.0f} '
+        'us (the profiler itself takes time).',
+        '',
+        '| kernel | an update | us an update | share |',
+        '|---|---:|---:|---:|',
+    ]
+    for event in kernels[:TOP]:
+        took = getattr(event, time_of) / PROFILED
+        name = event.key[:90].replace('|', '/')
+        lines.append(
+            f'| `{name}` | {event.count / PROFILED:.1f} | {took:.1f} | {took / busy:.0%} |'
+        )
+    return '\n'.join(lines)
+
+
+def spread(values: list[float], form: str) -> str:
+    """Median [lowest, highest]."""
+    return f'{statistics.median(values):{form}} [{min(values):{form}}, {max(values):{form}}]'
+
+
+def table(rows: list[dict[str, Any]]) -> list[str]:
+    """A line for each size and form."""
+    lines = [
+        '| size | form | updates/s | of eager | phase [ms] | first [s] |',
+        '|---|---|---:|---:|---:|---:|',
+    ]
+    eager: list[float] = []
+    for task, form in dict.fromkeys((row['task'], row['form']) for row in rows):
+        some = [row for row in rows if (row['task'], row['form']) == (task, form)]
+        rates = [row['updates'] / row['seconds'] for row in some]
+        eager = rates if form == 'eager' else eager  # the first form of each task
+        ratios = [a / b for a, b in zip(rates, eager, strict=True)]
+        phases = [1000 * row['phase_s'] for row in some]
+        cells = [task, form, spread(rates, '.0f'), spread(ratios, '.2f'), spread(phases, '.1f')]
+        lines.append(f'| {" | ".join(cells)} | {some[0]["first_s"]:.1f} |')
+    return lines
+
+
+def device_facts(device: str) -> dict[str, str]:
+    """What the GPU is."""
+    if device == 'cpu':
+        return {'GPU': 'none: the numbers are those of a CPU'}
+    return {
+        'GPU': torch.cuda.get_device_name(device),
+        'CUDA': str(torch.version.cuda),
+        'float32 products': torch.get_float32_matmul_precision(),
+    }
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument('--device', default='cuda')
+    parser.add_argument('--steps', type=int, default=1_000_000, help='of the memory')
+    parser.add_argument('--updates', type=int, default=2000, help='of a round')
+    parser.add_argument('--rounds', type=int, default=5)
+    parser.add_argument('--batch', type=int, default=256)
+    parser.add_argument('--width', type=int, default=256)
+    parser.add_argument('--only', choices=list(SIZES), help='one size')
+    parser.add_argument('--out', type=Path, default=RESULTS)
+    arguments = parser.parse_args()
+    facts = machine.facts(machine.load(), ['torch', 'numpy']) | device_facts(arguments.device)
+    rows, profiles = [], []
+    for task in [arguments.only] if arguments.only else SIZES:
+        some, said = measure(task, arguments)
+        rows += some
+        profiles.append(said)
+        print('\n'.join(table(some)), flush=True)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    with (arguments.out / 'rounds.csv').open('w', newline='') as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    (arguments.out / 'machine.json').write_text(json.dumps(facts, indent=2) + '\n')
+    text = [
+        '# SAC updates per second on a GPU, sampling included',
+        '',
+        f'{"; ".join(f"{name} {value}" for name, value in facts.items())}.',
+        '',
+        f'{arguments.steps} steps in the memory, batch {arguments.batch}, width '
+        f'{arguments.width}, {arguments.rounds} rounds of {arguments.updates} updates. Median '
+        'round [lowest, highest]. What is compared: `benchmarks/sac_gpu.py`.',
+        '',
+        *table(rows),
+        '',
+        f'## What is left, {PROFILED} updates each',
+        '',
+        '\n\n'.join(profiles),
+    ]
+    (arguments.out / 'table.md').write_text('\n'.join(text) + '\n')
+
+
+if __name__ == '__main__':
+    main()
