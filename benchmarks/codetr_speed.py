@@ -11,8 +11,10 @@ observations, 8 actions), for each delay n:
 Each is set against its floor: the floating point operations that it needs
 (`codetr_ros.rewards.cost`), at the rate that products of float32 matrices reach in the same round.
 That rate is the higher one of two shapes: 256x256 by 256x256, and the tokens of 64 segments of 25
-steps by the MLP's weights. A ratio of 1 is as fast as the products alone. Rounds go through
-everything in turn; the table gives the median round, and the lowest and highest in brackets.
+steps by the MLP's weights. A ratio of 1 is as fast as the products alone. `as written` is the
+same ratio with the operations of a network that is written plainly, with the tokens that nobody
+reads and the products that are then masked, which are left out here. Rounds go through everything
+in turn; the table gives the median round, and the lowest and highest in brackets.
 
 `--clock cpu` counts the time that the processor worked instead of the time on the wall: for one
 thread on a machine that does other things as well.
@@ -72,24 +74,27 @@ class Work:
         self.ids = self.memory.segment_ids()[:segments]
         self.steps = 0
 
-    def gradient(self) -> int:
-        """One gradient step; the operations it needs."""
+    def gradient(self) -> tuple[int, int]:
+        """One gradient step; the operations that it needs, and those of the plain form."""
         seed_torch(0, 'reward', self.steps)
         self.model.gradient_step(self.memory, generator(0, 'reward', self.steps))
         self.steps += 1
-        return self._cost(self.settings.codetr.batch).gradient
+        needed, plain = self._costs(self.settings.codetr.batch)
+        return needed.gradient, plain.gradient
 
-    def label(self) -> int:
-        """Label some segments; the operations that it needs."""
+    def label(self) -> tuple[int, int]:
+        """Label some segments; the operations that it needs, and those of the plain form."""
         for i in range(0, len(self.ids), self.model.label_batch):
             some = self.ids[i : i + self.model.label_batch]
             for _ in self.model.label_passes(self.memory, some):
                 pass
-        return self._cost(len(self.ids)).forward
+        needed, plain = self._costs(len(self.ids))
+        return needed.forward, plain.forward
 
-    def _cost(self, segments: int) -> Cost:
+    def _costs(self, segments: int) -> tuple[Cost, Cost]:
         settings = self.settings
-        return Cost(settings.codetr, OBSERVATION, ACTION, segments, settings.delay)
+        size = settings.codetr, OBSERVATION, ACTION, segments, settings.delay
+        return Cost(*size), Cost(*size, plain=True)
 
 
 def sgemm() -> float:
@@ -112,11 +117,12 @@ CLOCKS: dict[str, Callable[[], float]] = {'wall': time.perf_counter, 'cpu': time
 clock = 'wall'
 
 
-def measure(delay: int, threads: int, rounds: int) -> list[dict[str, Any]]:
-    """All rounds of one delay and number of threads."""
+def measure(delay: int, threads: int, precision: str, rounds: int) -> list[dict[str, Any]]:
+    """All rounds of one delay, number of threads and precision."""
     torch.set_num_threads(threads)
-    work = Work(load('paper').changed({'delay': delay, 'threads': threads}))
-    tasks: dict[str, tuple[Callable[[], int], int]] = {
+    changes = {'delay': delay, 'threads': threads, 'codetr.precision': precision}
+    work = Work(load('paper').changed(changes))
+    tasks: dict[str, tuple[Callable[[], tuple[int, int]], int]] = {
         'gradient': (work.gradient, 1),
         'label': (work.label, len(work.ids) * delay),
     }
@@ -127,35 +133,39 @@ def measure(delay: int, threads: int, rounds: int) -> list[dict[str, Any]]:
         for name, (task, units) in tasks.items():
             before = sgemm()
             began = CLOCKS[clock]()
-            flops = task()
+            flops, plain = task()
             seconds = CLOCKS[clock]() - began
             floor = (before + sgemm()) / 2  # a virtual machine's speed changes within seconds
             rows.append(
-                {'delay': delay, 'threads': threads, 'what': name, 'round': n}
+                {'delay': delay, 'threads': threads, 'precision': precision}
+                | {'what': name, 'round': n}
                 | {'seconds': round(seconds, 5), 'units': units, 'flops': flops}
                 | {'sgemm_gflops': round(floor / 1e9, 2)}
                 | {'ratio': round(flops / seconds / floor, 4)}
+                | {'plain_ratio': round(plain / seconds / floor, 4)}
             )
     print(line(rows), flush=True)
     return rows
 
 
+SIZE = ('delay', 'threads', 'precision')
 HEAD = (
-    '| n | threads | sgemm [GFLOP/s] | gradient steps/s | of the floor '
-    '| labelled steps/s | of the floor |\n|---|---|---|---|---|---|---|'
+    '| n | threads | precision | sgemm [GFLOP/s] | gradient steps/s | of the floor | as written '
+    '| labelled steps/s | of the floor | as written |\n|---|---|---|---|---|---|---|---|---|---|'
 )
 
 
 def line(rows: list[dict[str, Any]]) -> str:
-    """The table's line for one delay and number of threads."""
-    cells = [f'{rows[0]["delay"]}', f'{rows[0]["threads"]}']
+    """The table's line for one delay, number of threads and precision."""
+    cells = [str(rows[0][name]) for name in SIZE]
     cells.append(f'{statistics.median(row["sgemm_gflops"] for row in rows):.0f}')
     for what in ('gradient', 'label'):
         mine = [row for row in rows if row['what'] == what]
         rate = statistics.median(row['units'] / row['seconds'] for row in mine)
-        ratios = [row['ratio'] for row in mine]
         cells.append(f'{rate:.2f}' if what == 'gradient' else f'{rate:.0f}')
-        cells.append(f'{statistics.median(ratios):.2f} [{min(ratios):.2f}, {max(ratios):.2f}]')
+        for kind in ('ratio', 'plain_ratio'):
+            ratios = [row[kind] for row in mine]
+            cells.append(f'{statistics.median(ratios):.2f} [{min(ratios):.2f}, {max(ratios):.2f}]')
     return f'| {" | ".join(cells)} |'
 
 
@@ -166,14 +176,13 @@ def write(rows: list[dict[str, Any]], out: Path, facts: dict[str, str]) -> None:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    sizes = dict.fromkeys((row['delay'], row['threads']) for row in rows)
+    of: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for row in rows:
+        of.setdefault(tuple(row[name] for name in SIZE), []).append(row)
     text = ['# Gradient steps and labels of CoDeTr per second', '']
     text += [f'- {name}: {value}' for name, value in facts.items()]
     text += ['', 'Median round [lowest, highest]. What is measured: `benchmarks/codetr_speed.py`.']
-    text += ['', HEAD]
-    text += [
-        line([row for row in rows if (row['delay'], row['threads']) == size]) for size in sizes
-    ]
+    text += ['', HEAD, *map(line, of.values())]
     out.with_suffix('.md').write_text('\n'.join(text) + '\n')
 
 
@@ -185,6 +194,7 @@ def main() -> None:
     )
     parser.add_argument('--delays', type=int, nargs='+', default=DELAYS)
     parser.add_argument('--threads', type=int, nargs='+', default=[1, 2])
+    parser.add_argument('--precisions', nargs='+', default=['float32', 'bfloat16'])
     parser.add_argument('--rounds', type=int, default=7)
     parser.add_argument('--clock', choices=list(CLOCKS), default='wall')
     parser.add_argument('--out', type=Path, default=RESULTS, help='without its suffix')
@@ -195,7 +205,8 @@ def main() -> None:
     rows = []
     for threads in arguments.threads:
         for delay in arguments.delays:
-            rows += measure(delay, threads, arguments.rounds)
+            for precision in arguments.precisions:
+                rows += measure(delay, threads, precision, arguments.rounds)
     facts = machine.facts(load_before, ('torch', 'numpy'))
     facts |= {'clock': clock, 'rounds': str(arguments.rounds), 'command': ' '.join(sys.argv)}
     write(rows, arguments.out, facts)

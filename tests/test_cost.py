@@ -1,6 +1,7 @@
 """The cost of the reward transformer, against what torch counts of it."""
 
 import builders
+import plain_transformer
 import pytest
 import torch
 from torch.nn.attention import SDPBackend, sdpa_kernel
@@ -33,3 +34,10 @@ def test_the_operations_counted_are_those_that_torch_takes(tokens, weights, laye
     with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counted:
         (w * rhat).sum().backward()
     assert counted.get_total_flops() == cost.gradient - cost.forward + 2 * cost.unseen
+    plain = Cost(settings, O, A, B, L, plain=True)
+    with FlopCounterMode(display=False) as counted:
+        w, rhat = plain_transformer.forward(network, settings, *inputs)
+    assert counted.get_total_flops() == plain.forward and plain.unseen == 0
+    with FlopCounterMode(display=False) as counted:
+        (w * rhat).sum().backward()
+    assert counted.get_total_flops() == plain.gradient - plain.forward

@@ -96,6 +96,28 @@ def test_without_training_nothing_is_dropped(tokens):
         )
 
 
+@pytest.mark.parametrize('dropout', [0.0, 0.3])
+@pytest.mark.parametrize('tokens', ['pair', 'merged'])
+def test_in_bfloat16_outputs_and_gradients_are_nearly_the_same(tokens, dropout):
+    torch.set_default_dtype(torch.float32)
+    torch.manual_seed(0)
+    chosen = settings(tokens=tokens, dropout=dropout, embedding=32)
+    found = []
+    for precision in ('float32', 'bfloat16'):
+        torch.manual_seed(0)
+        network = RewardTransformer(O, A, L, chosen.model_copy(update={'precision': precision}))
+        given = inputs()
+        torch.manual_seed(1)
+        w, rhat = network(*given)
+        ((w * rhat) * given[2]).square().sum().backward()
+        gradient = torch.cat([p.grad.flatten() for p in network.parameters()])
+        found.append((w[given[2]], rhat[given[2]], gradient))
+    # the gradient is that of a square: small errors of outputs are large ones of it
+    for full, half, tolerance in zip(*found, (0.03, 0.03, 0.15), strict=True):
+        assert half.dtype == torch.float32 and not torch.equal(full, half)
+        assert (half - full).norm() < tolerance * full.norm()
+
+
 # ------------------------------------------------------------------------------------------- masks
 
 

@@ -131,6 +131,12 @@ class CodetrSettings(Group):
     label_batch: int = Field(
         256, ge=1, le=65536, description='segments or windows labelled in one pass'
     )
+    precision: Literal['float32', 'bfloat16'] = Field(
+        'float32',
+        description="of the causal layers' products; weights and heads are float32 in any case. "
+        'bfloat16 rounds to 8 bits, and is faster for large networks where the processor has it '
+        '(avx512_bf16, amx)',
+    )
 
     @model_validator(mode='after')
     def _heads_divide_embedding(self) -> 'CodetrSettings':

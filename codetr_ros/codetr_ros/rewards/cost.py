@@ -21,6 +21,8 @@ class Cost:
         action_size: A.
         windows: B.
         steps: L, of each window.
+        plain: count what a network takes that is written plainly: all tokens through all layers,
+            and products with tokens that are then masked.
     """
 
     settings: CodetrSettings
@@ -28,6 +30,7 @@ class Cost:
     action_size: int
     windows: int
     steps: int
+    plain: bool = False
 
     @property
     def forward(self) -> int:
@@ -43,24 +46,25 @@ class Cost:
 
     @property
     def unseen(self) -> int:
-        """Of a forward pass that multiplies with all tokens and masks those that are not seen: so
-        many more.
-        """
-        tokens, read = self._tokens
-        every = (self.settings.layers - 1) * tokens**2 + read * tokens
+        """By how much a forward pass that masks tokens in place of leaving them out takes more."""
+        tokens, last = self._tokens
+        every = (self.settings.layers - 1) * tokens**2 + last * tokens
         return 4 * self.windows * self.settings.embedding * (every - self._seen)
 
     @property
     def _tokens(self) -> tuple[int, int]:
-        """Tokens of a window, and how many of them are read at the end: one for each step."""
-        return self.steps * (2 if self.settings.tokens == 'pair' else 1), self.steps
+        """Tokens of a window, and how many of them the last layer makes: one for each step."""
+        tokens = self.steps * (2 if self.settings.tokens == 'pair' else 1)
+        return tokens, tokens if self.plain else self.steps
 
     @property
     def _seen(self) -> int:
         """Pairs of a token and one that it sees, in all layers of one window."""
-        tokens, read = self._tokens
+        tokens, _ = self._tokens
+        if self.plain:
+            return self.settings.layers * tokens**2
         triangle = tokens * (tokens + 1) // 2
-        last = read * (read + 1) if self.settings.tokens == 'pair' else triangle
+        last = self.steps * (self.steps + 1) if self.settings.tokens == 'pair' else triangle
         return (self.settings.layers - 1) * triangle + last
 
     @property
@@ -71,12 +75,12 @@ class Cost:
     @property
     def _products(self) -> int:
         d, layers = self.settings.embedding, self.settings.layers
-        tokens, read = self._tokens
+        tokens, last = self._tokens
         # of width d to d: key and value of each token; query, output and MLP of those needed
-        squares = layers * 2 * tokens + 10 * ((layers - 1) * tokens + read)
+        squares = layers * 2 * tokens + 10 * ((layers - 1) * tokens + last)
         attention = 2 * d * self._seen
-        head = read * d  # the reward
+        head = self.steps * d  # the reward
         if self.settings.weights == 'attention':
-            squares += 2 * read
-            head += read**2 * d
+            squares += 2 * self.steps
+            head += self.steps**2 * d
         return 2 * self.windows * (squares * d**2 + attention + head)

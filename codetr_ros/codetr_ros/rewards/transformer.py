@@ -37,16 +37,13 @@ class CausalSelfAttention(nn.Module):
         b, n, d = h.shape
         size = d // self.heads
         if every == 1:
-            q, k, v = self.qkv(h).view(b, n, 3, self.heads, size).permute(2, 0, 3, 1, 4)
+            parts = self.qkv(h).view(b, n, 3, self.heads, size).unbind(2)
         else:
             weight, bias = self.qkv.weight, self.qkv.bias
             asking = F.linear(h[:, every - 1 :: every], weight[:d], bias[:d])  # (B, N/every, d)
-            q = asking.view(b, -1, self.heads, size).transpose(1, 2)
-            k, v = (
-                F.linear(h, weight[d:], bias[d:])
-                .view(b, n, 2, self.heads, size)
-                .permute(2, 0, 3, 1, 4)
-            )
+            seen = F.linear(h, weight[d:], bias[d:]).view(b, n, 2, self.heads, size)
+            parts = (asking.view(b, -1, self.heads, size), *seen.unbind(2))
+        q, k, v = (part.transpose(1, 2) for part in parts)  # each (B, H, tokens, d/H)
         y = causal_attention(q, k, v, self.dropout if self.training else 0.0)  # (B, H, N', d/H)
         mixed: Tensor = self.out(y.transpose(1, 2).reshape(b, -1, d))
         return mixed
@@ -93,8 +90,9 @@ class Block(nn.Module):
         dropout = self.dropout if self.training else 0.0
         mixed = self.attention(self.norm1(h), every)  # (B, N/every, d)
         h = add_dropped(h[:, every - 1 :: every], mixed, dropout)
-        wide = self.widen(self.norm2(h)).relu_()  # (B, N/every, 4d)
-        return add_dropped(h, self.narrow(wide), dropout)
+        # of rows, not windows: in place on a view would cost two copies on the way back
+        wide = self.widen(self.norm2(h).flatten(0, 1)).relu_()  # (B N/every, 4d)
+        return add_dropped(h, self.narrow(wide).view(h.shape), dropout)
 
 
 class CausalTransformer(nn.Module):
@@ -116,6 +114,7 @@ class CausalTransformer(nn.Module):
         self.position = nn.Embedding(positions, d)
         self.norm_in = nn.LayerNorm(d)
         self.dropout = settings.dropout
+        self.rounded = settings.precision == 'bfloat16'
         self.blocks = nn.ModuleList(Block(settings) for _ in range(settings.layers))
         self.norm_out = nn.LayerNorm(d)
 
@@ -132,9 +131,11 @@ class CausalTransformer(nn.Module):
         if self.training and self.dropout:
             h = h * keep_mask(h.shape, self.dropout)
         *others, last = self.blocks
-        for block in others:
-            h = block(h)
-        x: Tensor = self.norm_out(last(h, 2 if self.pair else 1))  # (B, L, d)
+        with torch.autocast(h.device.type, torch.bfloat16, enabled=self.rounded):
+            for block in others:
+                h = block(h)
+            h = last(h, 2 if self.pair else 1)
+        x: Tensor = self.norm_out(h)  # (B, L, d)
         return x
 
 
