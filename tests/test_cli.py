@@ -276,6 +276,16 @@ def test_evaluate_refuses_what_it_cannot_evaluate(
     assert 'holds no checkpoint of the learner' in capsys.readouterr().err
 
 
+def test_a_policy_that_was_learnt_on_a_gpu_is_evaluated_without_one(
+    run_dir: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / 'run'
+    shutil.copytree(run_dir, folder)
+    learnt = run_folder.read_settings(folder).changed({'device': 'cuda'})
+    run_folder.write_settings(folder, learnt)
+    assert cli.main(['evaluate', str(folder), '--episodes', '1']) == 0
+
+
 def test_ctrl_c_ends_a_run_in_process_with_a_checkpoint_and_a_summary(tmp_path: Path) -> None:
     folder = tmp_path / 'run'
     command = [sys.executable, '-m', 'codetr_ros.cli', 'train', '--in-process', '--out', folder]

@@ -42,7 +42,8 @@ def main(arguments: Sequence[str]) -> int:
     folder = Path(given.run_dir)
     try:
         settings = run_folder.read_settings(folder)
-        changes: dict[str, int] = {'evaluate_every': 1}
+        # the policy of a run that learnt on a GPU needs none
+        changes: dict[str, int | str] = {'evaluate_every': 1, 'device': 'cpu'}
         if given.episodes is not None:
             changes['evaluate_episodes'] = given.episodes
         if given.seed is not None:
