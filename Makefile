@@ -3,23 +3,26 @@
 PYTHON ?= python3
 VENV := .venv
 ARGS ?=
+BENCH ?= simulator sac_updates codetr_speed nodes throughput recording_overhead bags growth memory
 
 # A shell in which another ROS or another environment is sourced must not mix with this one: its packages would be
 # imported before ours, and the wheels search the directories of LD_LIBRARY_PATH in no fixed order.
 unexport PYTHONPATH PYTHONHOME LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE AMENT_PREFIX_PATH
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test lint format clean
+.PHONY: help setup train test lint format bench clean
 
 help:
 	@echo "make train    set up what is missing, then learn the default task and watch it    (codetr train)"
 	@echo "make test     set up what is missing, then run all tests, lint and types included (pytest)"
 	@echo "make lint     lint, format and type checks alone"
+	@echo "make bench    measure how fast everything is, some two hours on a machine that does nothing else (benchmarks/)"
 	@echo "make format   put the code into the house format"
 	@echo "make setup    the set-up alone, into $(VENV)"
 	@echo "make clean    remove $(VENV) and every cache; runs are kept"
 	@echo
 	@echo "ARGS='...' is passed on:  make train ARGS='--config cpu --task Hopper-v5'   make test ARGS='-m \"not slow\"'"
+	@echo "BENCH='...' names those to run: make bench BENCH='simulator nodes'"
 	@echo "PYTHON=... chooses the interpreter (3.10 to 3.13):  make test PYTHON=python3.12"
 
 setup:
@@ -42,6 +45,9 @@ lint: setup
 format: setup
 	@$(VENV)/bin/ruff format .
 	@$(VENV)/bin/ruff check --fix .
+
+bench: setup
+	@for script in $(BENCH); do echo "== benchmarks/$$script.py"; $(VENV)/bin/python benchmarks/$$script.py || exit 1; done
 
 clean:
 	rm -rf $(VENV) .venv-removed .hypothesis .mypy_cache .pytest_cache .ruff_cache MUJOCO_LOG.TXT

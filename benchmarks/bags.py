@@ -1,7 +1,7 @@
 """How fast are bags recorded, verified, recovered, read and played, against rosbags in the same
 call?
 
-    .venv/bin/python benchmarks/bags.py --out benchmarks/results/bags
+    .venv/bin/python benchmarks/bags.py
 
 Steps have Ant's sizes: 8 actions and 27 observations (Ant-v4) or 105 (Ant-v5). A million of each,
 random numbers, in the shape of a run: chunks of 500 steps, a phase and its commit every 1000, an
@@ -69,6 +69,7 @@ from codetr_ros.records import (
 from codetr_ros.trajectories import Trajectories
 
 PHASE, CHUNK, DELAY, ACTIONS = 1000, 500, 25, 8
+RESULTS = Path(__file__).parent / 'results' / 'bags'
 COLUMNS = ('what', 'by', 'observations', 'steps', 'seconds', 'cpu_s', 'steps_per_s', 'MB_per_s')
 
 
@@ -308,15 +309,16 @@ def main() -> None:
     )
     parser.add_argument('--steps', type=int, default=1_000_000, help='a multiple of 1000')
     parser.add_argument('--observations', type=int, nargs='+', default=[105, 27])
-    parser.add_argument('--out', type=Path, help='folder for bags.csv and bags.md')
+    parser.add_argument(
+        '--out', type=Path, default=RESULTS, help='folder for bags.csv and bags.md'
+    )
     given = parser.parse_args()
     about = circumstances(machine.load())
     rows: list[dict[str, Any]] = []
     for observations in given.observations:
         with tempfile.TemporaryDirectory(prefix='codetr-bags-') as folder:
             rows += measure(given.steps, observations, Path(folder))
-        if given.out:
-            save(given.out, rows, about)
+        save(given.out, rows, about)
     print(table(rows, about))
 
 
