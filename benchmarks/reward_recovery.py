@@ -52,6 +52,8 @@ VARIANTS: dict[str, dict[str, object]] = {
     'pair tokens': {'codetr.tokens': 'pair'},
     'dropout 0.1': {'codetr.dropout': 0.1},
     'learning rate 3e-4': {'codetr.learning_rate': 3e-4},
+    'learning rate 5e-5': {'codetr.learning_rate': 5e-5},
+    'schedule cosine': {'codetr.schedule': 'cosine'},
     'raw observations': {'codetr.normalise_observations': False},
     'raw targets': {'target_scale': 'none'},
     'context episode': {'codetr.context': 'episode', 'codetr.window': 50},
