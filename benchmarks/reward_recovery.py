@@ -178,18 +178,20 @@ def write_table(path: Path) -> None:
         rows = list(csv.DictReader(file))
     shown = COLUMNS[4:10]
     lines = [
-        f'| composite | variant | seeds | {" | ".join(shown)} | within_pearson, by seed |',
-        '|---|---|---:|' + '---:|' * len(shown) + '---|',
+        f'| composite | variant | steps | seeds | {" | ".join(shown)} | within_pearson, by seed |',
+        '|---|---|---:|---:|' + '---:|' * len(shown) + '---|',
     ]
     groups: dict[tuple[str, str, str], list[dict[str, str]]] = {}
     for row in rows:
         groups.setdefault((row['composite'], row['variant'], row['gradient_steps']), []).append(
             row
         )
-    for (name, variant, _), group in groups.items():
+    for (name, variant, steps), group in groups.items():
         means = [f'{sum(float(row[c]) for row in group) / len(group):.2f}' for c in shown]
         each = ', '.join(f'{float(row["within_pearson"]):.2f}' for row in group)
-        lines.append(f'| {name} | {variant} | {len(group)} | {" | ".join(means)} | {each} |')
+        lines.append(
+            f'| {name} | {variant} | {steps} | {len(group)} | {" | ".join(means)} | {each} |'
+        )
     path.with_suffix('.md').write_text('\n'.join(lines) + '\n')
 
 
