@@ -7,19 +7,22 @@ from collections.abc import Iterable
 from importlib.metadata import version
 from pathlib import Path
 
+HERE = Path(__file__).parent
 LOUD = 0.5
 """Load average above which a machine is not idle."""
 
 
 def commit() -> str:
-    """The commit that is measured, marked where tracked files have been changed."""
+    """The commit that is measured, marked where tracked files other than results have changed."""
+    name = _git('describe', '--always', '--exclude', '*').stdout.strip()
+    code = _git('diff', '--quiet', 'HEAD', '--', ':/', ':(top,exclude)benchmarks/results')
+    return name + ('-dirty' if code.returncode else '')
+
+
+def _git(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        ['git', 'describe', '--always', '--dirty', '--exclude', '*'],
-        cwd=Path(__file__).parent,
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout.strip()
+        ['git', *arguments], cwd=HERE, capture_output=True, text=True, check=False
+    )
 
 
 def processor() -> str:
