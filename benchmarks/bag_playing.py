@@ -7,9 +7,9 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterable
 from pathlib import Path
 
+import machine
 from codetr_ros import launcher
 from codetr_ros.config import Settings
 
@@ -20,15 +20,6 @@ BEGUN, LEARNT = 'phase 0 is played', 'everything is played and learnt from'
 def available() -> bool:
     """Whether there is ROS to play with."""
     return importlib.util.find_spec('rclpy') is not None
-
-
-def cpu_seconds(processes: Iterable[int]) -> float:
-    """CPU seconds that processes have used so far, all together."""
-    ticks = 0
-    for number in processes:
-        stat = Path(f'/proc/{number}/stat').read_text()
-        ticks += sum(map(int, stat.rpartition(')')[2].split()[11:13]))  # user, system
-    return ticks / os.sysconf('SC_CLK_TCK')
 
 
 def play(bag: Path, settings: Settings, logs: Path) -> tuple[float, float]:
@@ -80,5 +71,5 @@ def _watch(
     for line in player.stdout:
         said.append(line)
         if BEGUN in line or LEARNT in line:
-            spent.append((time.perf_counter(), cpu_seconds(both)))
+            spent.append((time.perf_counter(), sum(map(machine.cpu_seconds, both))))
     return spent, said

@@ -164,8 +164,7 @@ def line(rows: list[dict[str, Any]]) -> str:
         rate = statistics.median(row['units'] / row['seconds'] for row in mine)
         cells.append(f'{rate:.2f}' if what == 'gradient' else f'{rate:.0f}')
         for kind in ('ratio', 'plain_ratio'):
-            ratios = [row[kind] for row in mine]
-            cells.append(f'{statistics.median(ratios):.2f} [{min(ratios):.2f}, {max(ratios):.2f}]')
+            cells.append(machine.spread([row[kind] for row in mine], '.2f'))
     return f'| {" | ".join(cells)} |'
 
 

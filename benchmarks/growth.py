@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import machine
+import throughput
 
 RESULTS = Path(__file__).parent / 'results'
 TASK = 'HalfCheetah-v5'
@@ -54,7 +55,7 @@ def one_run(steps: int) -> dict[str, Any]:
             raise SystemExit(f'{" ".join(command)} failed:\n{(done.stdout + done.stderr)[-4000:]}')
         summary = json.loads((out / 'summary.json').read_text())
         start = (out / 'config.yaml').stat().st_mtime_ns
-        first, commits = marks(out / 'bag')
+        first, commits = throughput.marks_of_bag(out / 'bag')
         size = sum(path.stat().st_size for path in (out / 'bag').iterdir())
     tenth = max(1, len(commits) // 10)
     phase = steps / len(commits)
@@ -69,23 +70,6 @@ def one_run(steps: int) -> dict[str, Any]:
             for said in summary['processes'].values()
         },
     }
-
-
-def marks(bag: Path) -> tuple[int, list[int]]:
-    """When a bag's first permission was published, and when its commits were recorded [ns]."""
-    from mcap.reader import make_reader
-
-    first: int | None = None
-    commits = []
-    for path in sorted(bag.glob('*.mcap')):
-        with path.open('rb') as file:
-            for _, channel, message in make_reader(file).iter_messages():
-                if channel.topic.endswith('/policy') and first is None:
-                    first = message.publish_time
-                elif channel.topic.endswith('/commits'):
-                    commits.append(message.log_time)
-    assert first is not None
-    return first, commits
 
 
 def rows_of(lengths: Sequence[int], runs: Sequence[dict[str, Any]]) -> list[tuple[Any, ...]]:

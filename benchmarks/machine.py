@@ -2,8 +2,9 @@
 
 import os
 import platform
+import statistics
 import subprocess
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -40,6 +41,26 @@ def load() -> str:
     """
     average = os.getloadavg()[0]
     return f'{average:.2f}' + (' (the machine was NOT idle)' if average > LOUD else '')
+
+
+def cpu_seconds(process: int) -> float:
+    """CPU seconds, of user and system, that a process has used so far.
+
+    Args:
+        process: Its number.
+
+    Raises:
+        OSError: It is not there any more.
+    """
+    stat = Path(f'/proc/{process}/stat').read_text()
+    ticks = map(int, stat.rpartition(')')[2].split()[11:13])  # user, system
+    return sum(ticks) / os.sysconf('SC_CLK_TCK')
+
+
+def spread(values: Sequence[float], form: str) -> str:
+    """Median [lowest, highest], each formatted by `form`, such as '.2f'."""
+    low, middle, high = min(values), statistics.median(values), max(values)
+    return f'{middle:{form}} [{low:{form}}, {high:{form}}]'
 
 
 def facts(load_at_start: str, packages: Iterable[str] = ()) -> dict[str, str]:

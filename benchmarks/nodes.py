@@ -48,21 +48,14 @@ Row = tuple[str, str, str, float]
 # idle
 
 
-def cpu_seconds(node: launcher.Node) -> float:
-    """CPU seconds that a node's process has used."""
-    stat = Path(f'/proc/{node.process.pid}/stat').read_text()
-    user, system = stat.rpartition(')')[2].split()[11:13]
-    return (int(user) + int(system)) / os.sysconf('SC_CLK_TCK')
-
-
 def per_cent(nodes: Iterable[launcher.Node], seconds: float) -> dict[str, float]:
     """CPU of each node in per cent of a core over some seconds."""
     watched = [node for node in nodes if node.code is None]
-    before, began = [cpu_seconds(node) for node in watched], time.monotonic()
+    before, began = [machine.cpu_seconds(node.process.pid) for node in watched], time.monotonic()
     time.sleep(seconds)  # what is measured is what happens while nothing happens
     spent = time.monotonic() - began
     return {
-        node.name: 100 * (cpu_seconds(node) - then) / spent
+        node.name: 100 * (machine.cpu_seconds(node.process.pid) - then) / spent
         for node, then in zip(watched, before, strict=True)
     }
 

@@ -121,11 +121,9 @@ def cpu_of(node: launcher.Node) -> float:
     if node.role != 'record':
         return 0.0
     try:
-        stat = Path(f'/proc/{node.process.pid}/stat').read_text()
+        return machine.cpu_seconds(node.process.pid)
     except (FileNotFoundError, ProcessLookupError):
         return 0.0
-    user, system = stat.rpartition(')')[2].split()[11:13]
-    return (int(user) + int(system)) / os.sysconf('SC_CLK_TCK')
 
 
 def table(pairs: list[tuple[Run, Run]], facts: dict[str, str]) -> str:

@@ -23,7 +23,6 @@ with nothing to be learnt about a GPU.
 import argparse
 import csv
 import json
-import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -160,11 +159,6 @@ def profiled(sac: DeviceSAC, device: str) -> str:
     return '\n'.join(lines)
 
 
-def spread(values: list[float], form: str) -> str:
-    """Median [lowest, highest]."""
-    return f'{statistics.median(values):{form}} [{min(values):{form}}, {max(values):{form}}]'
-
-
 def table(rows: list[dict[str, Any]]) -> list[str]:
     """A line for each size and form."""
     lines = [
@@ -178,7 +172,8 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
         eager = rates if form == 'eager' else eager  # the first form of each task
         ratios = [a / b for a, b in zip(rates, eager, strict=True)]
         phases = [1000 * row['phase_s'] for row in some]
-        cells = [task, form, spread(rates, '.0f'), spread(ratios, '.2f'), spread(phases, '.1f')]
+        cells = [task, form, machine.spread(rates, '.0f'), machine.spread(ratios, '.2f')]
+        cells.append(machine.spread(phases, '.1f'))
         lines.append(f'| {" | ".join(cells)} | {some[0]["first_s"]:.1f} |')
     return lines
 

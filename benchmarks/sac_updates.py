@@ -296,11 +296,7 @@ def line_of(size: Size, rows: list[dict[str, Any]], clock: str) -> str:
     cells += [f'{statistics.median(r):.0f}' if r else '-' for r in rates.values()]
     for other in ('floor', 'sbx', 'sb3', 'plain', 'eager'):
         ratios = [a / b for a, b in zip(rates['compiled'], rates[other], strict=False)]
-        cells.append(
-            f'{statistics.median(ratios):.2f} [{min(ratios):.2f}, {max(ratios):.2f}]'
-            if ratios
-            else '-'
-        )
+        cells.append(machine.spread(ratios, '.2f') if ratios else '-')
     first = next(row for row in rows if row['name'] == 'compiled')
     cells += [f'{first["cold_s"]:.0f}', f'{first["ready_s"]:.0f}']
     return f'| {" | ".join(cells)} |'

@@ -34,7 +34,6 @@ the wall: for a machine that does other things as well. Threads are always timed
 import argparse
 import csv
 import os
-import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -329,19 +328,13 @@ def tables(rows: list[dict[str, Any]]) -> list[str]:
                 ]
                 for who in names
             }
-            cells = [spread(took[who], 1) for who in names]
+            cells = [machine.spread(took[who], '.1f') for who in names]
             for who in others:
                 pairs = zip(took['ours'], took[who], strict=True)
-                cells.append(spread([a / b for a, b in pairs], 2))
+                cells.append(machine.spread([a / b for a, b in pairs], '.2f'))
             lines.append(f'| {task} | {" | ".join(cells)} |')
         lines.append('')
     return lines
-
-
-def spread(values: list[float], digits: int) -> str:
-    """Median [lowest, highest]."""
-    low, middle, high = min(values), statistics.median(values), max(values)
-    return f'{middle:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]'
 
 
 def write(out: Path, rows: list[dict[str, Any]], text: str) -> None:

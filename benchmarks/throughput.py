@@ -220,7 +220,8 @@ def whole_run(flags: list[str], in_process: bool) -> dict[str, float]:
         if in_process:
             permission, commit = json.loads(marks.read_text())
         else:
-            permission, commit = marks_of_bag(out / 'bag')
+            permission, commits = marks_of_bag(out / 'bag')
+            commit = commits[-1]
         with (out / 'metrics.csv').open() as file:
             rows = list(csv.DictReader(file))
     work = dict.fromkeys(WORK, 0.0)
@@ -239,8 +240,8 @@ def whole_run(flags: list[str], in_process: bool) -> dict[str, float]:
     }
 
 
-def marks_of_bag(bag: Path) -> tuple[int, int]:
-    """When a bag's first permission was published and its last commit recorded [ns]."""
+def marks_of_bag(bag: Path) -> tuple[int, list[int]]:
+    """When a bag's first permission was published, and when its commits were recorded [ns]."""
     from mcap.reader import make_reader
 
     permissions, commits = [], []
@@ -251,7 +252,7 @@ def marks_of_bag(bag: Path) -> tuple[int, int]:
                     permissions.append(message.publish_time)
                 elif channel.topic.endswith('/commits'):
                     commits.append(message.log_time)
-    return min(permissions), max(commits)
+    return min(permissions), sorted(commits)
 
 
 # ----------------------------------------------------------------------------------------------
