@@ -291,47 +291,6 @@ def test_a_process_without_a_report_is_named(tmp_path: Path, processes: Processe
     assert why_it_gave_up(node, tmp_path) is None
 
 
-HANGS = (
-    'from codetr_ros.ros.signals import Stop\nimport signal, threading\n'
-    'Stop().install().end_within(1)\n'
-    'signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})\n'
-    'threading.Event().wait()\n'
-)
-
-
-def test_a_node_that_hangs_once_it_has_saved_everything_is_ended_and_no_failure(
-    tmp_path: Path, processes: Processes, said: Said
-) -> None:
-    run_folder.write_report(tmp_path, 'record', 'record', {'finished': True, 'error': None})
-    command = Command('record', 'record', (sys.executable, '-c', HANGS))
-    processes.start([command], tmp_path, os.environ)
-
-    failure = supervise(
-        processes,
-        poll(processes),
-        Interrupts(),
-        Silence(),
-        lambda node: why_it_gave_up(node, tmp_path),
-    )
-
-    assert failure is None
-    assert processes.nodes[0].code == -signal.SIGALRM
-    assert any('record had saved everything' in line for line in said)
-
-
-def test_a_node_that_hangs_before_its_run_was_over_is_a_failure(
-    tmp_path: Path, processes: Processes
-) -> None:
-    run_folder.write_report(tmp_path, 'record', 'record', {'finished': False, 'error': 'tired'})
-    command = Command('record', 'record', (sys.executable, '-c', HANGS))
-    processes.start([command], tmp_path, os.environ)
-    why = lambda node: why_it_gave_up(node, tmp_path)  # noqa: E731
-
-    failure = supervise(processes, poll(processes), Interrupts(), Silence(), why)
-
-    assert failure == 'record ended before the run had finished: tired'
-
-
 def test_a_process_that_stays_when_all_else_has_ended_is_named_and_ended(
     tmp_path: Path, processes: Processes
 ) -> None:

@@ -35,11 +35,6 @@ HURRIED_DEADLINE = 2.0
 _POLL = 0.02  # seconds between looks at processes that are to end
 
 
-ENDED_WELL = (0, -signal.SIGALRM)
-"""Exit codes of a node that has saved everything. The second is that of one whose middleware then
-hung while it shut down: the node has the kernel end it after a while."""
-
-
 class LaunchError(RuntimeError):
     """Processes that cannot be started: says which and what to do."""
 
@@ -175,8 +170,8 @@ class Node:
 
     @property
     def unasked_failure(self) -> bool:
-        """Whether it ended without having saved everything, and not because it was asked to."""
-        return self.code not in (None, *ENDED_WELL) and not self.asked
+        """Whether it ended with an error, and not because it was asked to."""
+        return self.code not in (None, 0) and not self.asked
 
     def how_it_ended(self) -> str:
         """For people."""

@@ -57,7 +57,7 @@ def play(bag: Path, nodes: Nodes, *live: str) -> str:
             check=False,
         )
         assert done.returncode == 0, done.stdout + ''.join(map(nodes.log, live))
-        assert nodes.wait() == dict.fromkeys(live, 0)
+        assert nodes.wait() == dict.fromkeys(live, 0), ''.join(map(nodes.log, live))
     for name in live:
         report = nodes.report(name)
         assert report['lost'] == report['refused'] == report['duplicated'] == {}

@@ -8,7 +8,7 @@ from types import FrameType, TracebackType
 from typing import Any
 
 from codetr_ros import run_folder
-from codetr_ros.launcher import ENDED_WELL, Node, Processes
+from codetr_ros.launcher import Node, Processes
 from codetr_ros.records import Presence, Record
 
 SILENCE_DEADLINE = 90.0
@@ -99,7 +99,6 @@ def supervise(
         Why the run failed; None if it finished or was interrupted.
     """
     ended = 0
-    hung: list[Node] = []
     while True:
         poll()
         if interrupts.count:
@@ -107,14 +106,10 @@ def supervise(
             processes.stop()
             return _after_stop(processes)
         running = processes.running()
-        for node in processes.nodes:
-            if node.code == -signal.SIGALRM and node not in hung:
-                hung.append(node)
-                processes.say(f'{node.name} had saved everything; then its middleware hung')
         if (failed := processes.failed()) is not None:
             return _stop_all(processes, failed.how_it_ended())
         for node in processes.nodes:
-            if node.code in ENDED_WELL and (reason := gave_up(node)) is not None:
+            if node.code == 0 and (reason := gave_up(node)) is not None:
                 return _stop_all(processes, reason)
         if not running:
             return None
@@ -138,7 +133,7 @@ def _stop_all(processes: Processes, reason: str) -> str:
 def _after_stop(processes: Processes) -> str | None:
     """An interrupted run has failed only where a node did not end as it should."""
     # SIGINT itself ends a process that has not yet come so far as to handle it.
-    clean = (*ENDED_WELL, -signal.SIGINT)
+    clean = (0, -signal.SIGINT)
     odd = [node.how_it_ended() for node in processes.nodes if node.code not in clean]
     return '; '.join(odd) or None
 

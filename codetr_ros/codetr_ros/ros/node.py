@@ -130,9 +130,14 @@ class CoreNode(Joining):
                 self._say_fatal(problem, 'at the end: ')
         if self.stop.signal and not error and not finished:
             self.log.info(f'stopped by {self.stop.signal.name}')
-        self.stop.end_within(SHUTDOWN_DEADLINE)
+        code = 1 if error else 0
+        self.stop.end_within(SHUTDOWN_DEADLINE, code)
+        self.let_go()
+        return code
+
+    def let_go(self) -> None:
+        """Take everything that is the node's off the graph: last of all."""
         self.link.close()
-        return 1 if error else 0
 
     def _report(self, finished: bool, error: str | None) -> None:
         if self.folder is None:

@@ -257,8 +257,12 @@ class PlayNode(Played, CoreNode):
         for other in self._others:
             other.leave()
         super()._goodbye()
+
+    def let_go(self) -> None:
+        """Take everybody who is played off the graph."""
         for other in self._others:
             other.link.close()
+        super().let_go()
 
 
 def play(

@@ -6,8 +6,11 @@ of a record). Here a signal sets a flag, which the main loop looks at; a second 
 nothing.
 """
 
+import faulthandler
 import signal
 from types import FrameType
+
+from codetr_ros.ros import exit_timer
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -33,16 +36,16 @@ class Stop:
         self._installed = True
         return self
 
-    def end_within(self, seconds: int) -> None:
-        """Have the kernel end this process with SIGALRM if it is still there after that long.
+    def end_within(self, seconds: int, code: int) -> None:
+        """Have this process end with an exit code if it is still there after that long.
 
         For its last moments, when everything is saved: a middleware that hangs while it shuts down
         (seen, rarely, under load) holds the interpreter, and nothing written in Python could end
-        it.
+        it. A second before the end, it is written to standard error where the process hangs.
         """
         if self._installed:
-            signal.signal(signal.SIGALRM, signal.SIG_DFL)
-            signal.alarm(seconds)
+            faulthandler.dump_traceback_later(max(seconds - 1, 0.1))
+            exit_timer.start(seconds, code)
 
 
 def ignore() -> None:
