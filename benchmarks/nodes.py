@@ -109,7 +109,7 @@ def idle(settings: Settings, seconds: float) -> Iterator[Row]:
 
 def a_phase(phase: int) -> list[Record]:
     """1000 steps of Ant and their scores, in chunks as the simulator makes them."""
-    from codetr_ros.simulator import chunk_steps
+    from codetr_ros.source import chunk_steps
 
     rng = np.random.default_rng(phase)
     most, records = chunk_steps(OBSERVATIONS, ACTIONS), list[Record]()
