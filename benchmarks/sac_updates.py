@@ -5,7 +5,8 @@
 
     .venv/bin/python benchmarks/sac_updates.py --sbx /tmp/sbx-venv/bin/python
 
-Compared, each in a process of its own that does nothing while another works:
+Compared, each in a process of its own that does nothing while another works, and that may use as
+many processors as it is to have threads:
   - compiled: what `sac.compile=true` runs
   - eager: what `sac.compile=false` runs
   - plain: the same update by autograd, as a reader would write it (`learners/sac.py`)
@@ -195,6 +196,8 @@ def sgemm(size: Size) -> Callable[[int], None]:
 
 def work(name: str, size: Size) -> None:
     """Get ready, then do rounds as they are asked for on standard input."""
+    # not all packages keep to the number of threads that they are told
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: size.threads])
     began = time.perf_counter()
     if name == 'floor':
         run = sgemm(size)
