@@ -194,6 +194,26 @@ def test_a_run_is_played_in_whatever_order_its_topics_were_recorded(first, lag):
     assert sorted(map(id, found)) == sorted(map(id, late))
 
 
+def labels(phase, part=0):
+    one = np.array([0], np.uint32)
+    return StepRewards('run', phase, phase, part, 2, 'sim', one, one, one + 1, np.zeros(1, 'f4'))
+
+
+@pytest.mark.parametrize('late', [Transitions, CompositeReward, Commit])
+@pytest.mark.parametrize('by', [4, 10, 25])
+def test_labels_in_parts_hold_up_nothing_that_is_ready(late, by):
+    records = []
+    for r in a_run(phases=6):
+        records += [r, labels(r.phase, 0), labels(r.phase, 1)] if isinstance(r, Commit) else [r]
+    kinds = {type(r) for r in records} - {late}
+    mixed = topic_by_topic(records, dict.fromkeys(kinds, by))
+    found = [item.record for item in causal(played(mixed), 1)]
+    assert len(found) == len(mixed)
+    for kind in kinds | {late}:
+        said, meant = ([id(r) for r in some if isinstance(r, kind)] for some in (found, mixed))
+        assert said == meant, kind
+
+
 def test_a_commit_that_is_missing_is_an_error_and_nothing_waits_for_it():
     records = [r for r in a_run() if not (isinstance(r, Commit) and r.phase == 1)]
     p = playback(records)

@@ -54,6 +54,7 @@ def causal(found: Iterable[Said], lag: int) -> Iterator[Said]:
         if not lost and early(record):
             held.append(item)
             following = held.pop(0) if len(held) > _MOST_HELD else None
+        permits = False
         while following is not None:
             record = following.record
             if isinstance(record, Commit):
@@ -62,8 +63,9 @@ def causal(found: Iterable[Said], lag: int) -> Iterator[Said]:
                 key = publisher(record)
                 numbers[key] = max(numbers[key], record.sequence + 1)
             yield following
+            permits |= isinstance(record, _PERMITTING)  # else nothing has become ready
             ready = (i for i, one in enumerate(held) if not early(one.record))
-            at = next(ready, None) if isinstance(record, _PERMITTING) else None
+            at = next(ready, None) if permits else None
             following = held.pop(at) if at is not None else None
     yield from held
 
