@@ -363,6 +363,30 @@ def test_a_file_whose_beginning_the_disk_does_not_give_is_read_behind_it(tmp_pat
     assert kept == whole[-len(kept) :] and len(whole) - len(kept) < 10
 
 
+def test_a_beginning_that_the_disk_does_not_give_costs_no_chunk_that_the_summary_describes(
+    tmp_path, bad_disk
+):
+    bag = by_mcap(CompressionType.NONE, chunk_size=9000)(tmp_path / 'bag', RUN)
+    entries = list(Bag(bag).entries())
+    second = sorted({entry.place.offset for entry in entries})[1]
+    whole = messages(bag)
+    bad_disk(bag / 'a.mcap', range(512))
+    recover(bag, tmp_path / 'new')
+    first = sum(entry.place.offset < second for entry in entries)
+    assert messages(tmp_path / 'new') == whole[first:]
+
+
+def test_a_summary_that_the_disk_does_not_give_costs_no_message(tmp_path, bad_disk):
+    bag = ours(tmp_path / 'bag', RUN)
+    whole = messages(bag)
+    path = bag / 'bag_0.mcap'
+    size = path.stat().st_size
+    bad_disk(path, range(size - 100, size))
+    assert messages(bag) == whole  # what reads strictly does not mind
+    found = recover(bag, tmp_path / 'new')
+    assert messages(tmp_path / 'new') == whole and found.whole
+
+
 def test_a_split_that_is_no_file_costs_only_itself(tmp_path):
     bag = ours(tmp_path / 'bag', a_run(phases=40), split_bytes=32_000)
     last = Bag(bag).files[-1]

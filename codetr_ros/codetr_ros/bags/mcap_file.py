@@ -125,6 +125,9 @@ class McapFile:
             return  # the disk gives nothing of it
         ended = False
         while at < size:
+            if self._faulty and not self._borrowed:
+                self._borrow(file, size)
+            file.seek(at)
             try:
                 opcode, content = self._next(file, at, size, ended)
                 if ended:
@@ -143,12 +146,9 @@ class McapFile:
                 self._indexed = None
                 at = after
             except OSError as error:
-                at = self._unread(file, at, size, error)
+                at = self._unread(file, at, size, error, harmless=ended)
                 if at == size:
                     return
-            if self._faulty and not self._borrowed:
-                self._borrow(file, size)
-            file.seek(at)
         self._say(size, 'the file ends here, without its index: its writer was killed', 0)
 
     def _begin(self, file: BinaryIO, size: int) -> int:
@@ -156,17 +156,19 @@ class McapFile:
         try:
             magic = file.read(len(MAGIC))
         except OSError as error:
-            file.seek(after := self._unread(file, 0, size, error))
-            return after
+            return self._unread(file, 0, size, error)
         if magic != MAGIC:
             text = 'is empty' if not size else f'begins with {magic!r}: it is no MCAP file'
             self._say(0, text, size if size < len(MAGIC) else 0)
         return len(magic)
 
-    def _unread(self, file: BinaryIO, at: int, size: int, error: OSError) -> int:
+    def _unread(
+        self, file: BinaryIO, at: int, size: int, error: OSError, harmless: bool = False
+    ) -> int:
         """Say that the disk does not give what lies there; where to go on."""
         after = resume_at(file, at, size)
-        self._say(at, f'cannot be read: {error.strerror}', after - at, unread=True)
+        text = f'cannot be read: {error.strerror}'
+        self._say(at, text, after - at, harmless, unread=not harmless)
         self._indexed = None
         return after
 
