@@ -6,10 +6,9 @@ every chunk's CRC is checked, every definition compared, and the first fault is 
 the caller asks to be told of faults and to go on (`on_damage`).
 """
 
-import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cache
@@ -253,14 +252,32 @@ def open_file(
     folder = stack.enter_context(tempfile.TemporaryDirectory(prefix='codetr-bag-'))
     unpacked = Path(folder) / path.stem
     try:
-        with path.open('rb') as packed, unpacked.open('wb') as file:
-            shutil.copyfileobj(zstandard.ZstdDecompressor().stream_reader(packed), file)
+        with path.open('rb') as packed:
+            _write(zstandard.ZstdDecompressor().read_to_iter(packed), unpacked)
     except zstandard.ZstdError as error:
         _tell(Damage(Place(path, 0), f'its zstd data is damaged ({error})', 0), on_damage)
     except OSError as error:
-        text = f'cannot be unpacked to {unpacked}: {error.strerror}'
+        text = f'cannot be read: {error.strerror}'
         _tell(Damage(Place(path, 0), text, 0, unread=True), on_damage)
     return _KINDS[unpacked.suffix](unpacked, on_damage, path, thorough)
+
+
+def _write(pieces: Iterable[bytes], path: Path) -> None:
+    """Write what is read to a file.
+
+    Raises:
+        BagError: it cannot be written; errors of what is read pass through.
+    """
+    with path.open('wb') as file:
+        for piece in pieces:
+            try:
+                file.write(piece)
+                file.flush()
+            except OSError as error:
+                raise BagError(
+                    f'{path}, to which a bag is unpacked, cannot be written: {error.strerror}: '
+                    'make room there, or set TMPDIR to a folder that has some'
+                ) from error
 
 
 def _decompressed(data: bytes | memoryview) -> bytes:
