@@ -10,6 +10,10 @@ class BagError(RuntimeError):
     """
 
 
+class BagWriteError(BagError):
+    """A bag that the disk does not take: its cause is the system's error."""
+
+
 class Place(NamedTuple):
     """Where in a bag something lies."""
 

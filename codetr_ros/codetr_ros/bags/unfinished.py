@@ -37,12 +37,18 @@ def unfinished(folder: Path) -> Iterator[Path]:
         made = place / target.name
         made.mkdir()
         yield made
-        if room == target:  # the metadata, which makes it whole, comes last
-            for path in sorted(made.iterdir(), key=lambda path: path.name == METADATA):
-                os.rename(path, target / path.name)
-        else:
-            os.rename(made, target)
+        files = sorted(made.iterdir(), key=lambda path: path.name == METADATA)
+        try:
+            if room == target:  # the metadata, which makes it whole, comes last
+                for path in files:
+                    os.rename(path, target / path.name)
+            else:
+                os.rename(made, target)
+            sync_folder(target)
+            sync_folder(target.parent)
+        except OSError:
+            for path in files:
+                (target / path.name).unlink(missing_ok=True)
+            raise
     finally:
         shutil.rmtree(place, ignore_errors=True)
-    sync_folder(target)
-    sync_folder(target.parent)

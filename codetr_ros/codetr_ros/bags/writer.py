@@ -23,8 +23,9 @@ from typing import Any
 import yaml
 from mcap.writer import CompressionType, Writer
 
-from codetr_ros.bags.errors import BagError
+from codetr_ros.bags.errors import BagError, BagWriteError
 from codetr_ros.bags.metadata import METADATA, BagFile, render
+from codetr_ros.bags.raw import LIBRARY
 from codetr_ros.bags.topics import BagTopic, schema_text, type_hash
 from codetr_ros.run_folder import atomic_write, sync_folder
 
@@ -77,7 +78,7 @@ class McapWriter:
                 )
             self._open_file()
         except OSError as error:
-            raise BagError(
+            raise BagWriteError(
                 f'bag {folder} cannot be made: {error.strerror}; choose another folder'
             ) from error
 
@@ -107,7 +108,7 @@ class McapWriter:
             enable_crcs=True,
             enable_data_crcs=True,  # of what lies between the chunks, too
         )
-        self._writer.start(profile='ros2', library='codetr_ros')
+        self._writer.start(profile='ros2', library=LIBRARY)
         self._channels: dict[str, int] = {}
         self._again = self._stream.tell() + 1  # where to describe them next: in the second chunk
         schemas: dict[str, int] = {}
@@ -222,7 +223,7 @@ class McapWriter:
         self._stream.close()
         self._path, self._good = None, 0
 
-    def _broken(self, error: OSError) -> BagError:
+    def _broken(self, error: OSError) -> BagWriteError:
         """Cut the file back to the last whole chunk: half a chunk would spoil what comes before it
         for some readers.
         """
@@ -239,7 +240,7 @@ class McapWriter:
                 self._path.unlink()
         except OSError as failed:
             left += f' and not cut back to them ({failed.strerror}): half a chunk may follow'
-        return BagError(
+        return BagWriteError(
             f'bag {self._path or self.folder} cannot be written: {error.strerror}. It holds the '
             f'{self.size} bytes flushed before, {left}. Make room, or mend the disk: '
             f'`codetr bag recover {self.folder} --out NEW` makes it whole; start the run again in '
@@ -262,7 +263,7 @@ class McapWriter:
         try:
             atomic_write(self.folder / METADATA, render(self._files, self._topics.values()))
         except OSError as error:
-            raise BagError(
+            raise BagWriteError(
                 f'bag {self.folder} is whole but {METADATA} cannot be written: {error.strerror}; '
                 f'make room, `codetr bag recover {self.folder} --out NEW` writes it'
             ) from error

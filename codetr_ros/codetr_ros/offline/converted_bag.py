@@ -1,14 +1,14 @@
 """`codetr convert`: a bag to fit, of a bag with ordinary topics."""
 
-import shutil
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import closing
 from pathlib import Path
 
 from codetr_ros.bags.definitions import encode
-from codetr_ros.bags.errors import BagError
+from codetr_ros.bags.errors import BagError, BagWriteError
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.topics import BagTopic
+from codetr_ros.bags.unfinished import unfinished
 from codetr_ros.bags.writer import McapWriter
 from codetr_ros.offline.converting import Conversion, Converter, Timed
 from codetr_ros.offline.errors import FitError
@@ -34,24 +34,27 @@ def convert(bag: Bag, rules: Mapping, folder: Path) -> Conversion:
             f'{bag.path} has no topic {", ".join(missing)}. It has: {", ".join(bag.topics)}'
         )
     made = Converter(rules, folder.name)
-    names = {kind: f'/{rules.source}/{TOPICS[kind]}' for kind in (Transitions, CompositeReward)}
-    writer = McapWriter(
-        folder, [BagTopic(name, type_name(kind), 1000, False) for kind, name in names.items()]
-    )
     try:
-        for record, time in _records(bag, rules, made):
-            writer.write(names[type(record)], encode(record, time), time)
-        if not made.found.steps:
-            lost = ', '.join(f'{n} {what}' for what, n in made.found.dropped.items())
-            raise FitError(f'{bag.path}: not one step could be made: {lost or "no command"}')
-        writer.close()
-    except BaseException:
-        # half a bag must not pass for a whole one; the folder was new or empty
-        with suppress(BagError):
-            writer.close()
-        shutil.rmtree(folder)
-        raise
+        with unfinished(folder) as new:
+            _write(_records(bag, rules, made), rules.source, new)
+            if not made.found.steps:
+                lost = ', '.join(f'{n} {what}' for what, n in made.found.dropped.items())
+                raise FitError(f'{bag.path}: not one step could be made: {lost or "no command"}')
+    except (BagWriteError, OSError) as error:
+        reason = error.__cause__ if isinstance(error, BagWriteError) else error
+        raise BagError(
+            f'{folder} cannot be written: {reason}. Nothing of it is left: make room, and convert '
+            'again'
+        ) from error
     return made.found
+
+
+def _write(records: Iterator[Timed], source: str, folder: Path) -> None:
+    names = {kind: f'/{source}/{TOPICS[kind]}' for kind in (Transitions, CompositeReward)}
+    topics = [BagTopic(name, type_name(kind), 1000, False) for kind, name in names.items()]
+    with closing(McapWriter(folder, topics)) as writer:
+        for record, time in records:
+            writer.write(names[type(record)], encode(record, time), time)
 
 
 def _records(bag: Bag, rules: Mapping, made: Converter) -> Iterator[Timed]:
