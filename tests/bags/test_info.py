@@ -38,6 +38,14 @@ def test_info_shows_tables_and_json(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)['runs'][0]['steps'] == 60
 
 
+@pytest.mark.parametrize('command', ['info', 'verify'])
+def test_names_that_look_like_markup_are_shown_as_they_are(command, tmp_path, capsys):
+    bag = ours(tmp_path / 'seed [red]1[/]', a_run(run_id='a [/x] run'))
+    assert main(['bag', command, str(bag)]) == 0
+    said = ''.join(capsys.readouterr().out.split())  # it may be wrapped anywhere
+    assert 'a[/x]run' in said and 'seed[red]1[/]' in said
+
+
 @pytest.mark.parametrize('command', ['info', 'verify', 'recover'])
 def test_the_folder_of_a_run_stands_for_its_bag(command, tmp_path, capsys):
     ours(tmp_path / 'run' / 'bag', a_run())

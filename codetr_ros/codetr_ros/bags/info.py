@@ -19,7 +19,7 @@ from codetr_ros.records import (
     Transitions,
 )
 
-SETTINGS = ('task', 'composite', 'delay', 'method', 'steps', 'seed', 'simulators')
+SETTINGS = ('task', 'composite', 'delay', 'method', 'steps', 'seed', 'simulators', 'envs')
 """The settings that are shown."""
 _SMALL = 2.0**-64  # a sum of numbers so much smaller cannot overflow, and is as exact
 

@@ -9,7 +9,6 @@ from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
-from rich.markup import escape
 
 from codetr_ros import run_folder
 from codetr_ros.cli import FAILED, refuse
@@ -61,18 +60,19 @@ def show(report: Mapping[str, Any], limit: int, console: Console) -> None:
         shown[finding['kind']] += 1
         if shown[finding['kind']] <= limit:
             text = f'{finding["kind"]}: {finding["place"]}: {finding["text"]}'
-            console.print(escape(text), highlight=False)
+            console.print(text, markup=False, highlight=False)
     for kind, count in report['found'].items():
         if (more := count - min(shown[kind], limit)) > 0:  # of very many not all are named
-            console.print(f'{kind}: {more} more', highlight=False)
+            console.print(f'{kind}: {more} more', markup=False, highlight=False)
     for remark in report['remarks']:
-        console.print(f'note: {escape(remark)}', highlight=False)
+        console.print(f'note: {remark}', markup=False, highlight=False)
     for run in report['runs']:
         committed, whole = run['phases_committed'], run['phases_whole']
         if committed:
             text = f'run {run["run_id"]!r} in {run["namespace"]}: {committed} phases committed'
             last = f', whole up to phase {whole - 1}' if whole else ', none of them whole'
-            console.print(text + (', all whole' if whole == committed else last), highlight=False)
+            text += ', all whole' if whole == committed else last
+            console.print(text, markup=False, highlight=False)
     total = sum(report['found'].values())
     if total:
         kinds = ', '.join(f'{count} {kind}' for kind, count in report['found'].items())
@@ -81,7 +81,9 @@ def show(report: Mapping[str, Any], limit: int, console: Console) -> None:
             f'messages. `codetr bag recover {report["bag"]} --out NEW` makes a whole bag of what '
             'can be read',
             style='red',
+            markup=False,
             highlight=False,
         )
     else:
-        console.print(f'{report["bag"]}: sound, {report["messages"]} messages', style='green')
+        text = f'{report["bag"]}: sound, {report["messages"]} messages'
+        console.print(text, style='green', markup=False)
