@@ -24,8 +24,9 @@ tasks:
 
 Threads, for HalfCheetah and Ant: a phase of a simulator with as many environments (`envs`) as
 there are cores, acting with such a policy, resets and records included:
-  - ours: in as many threads
-  - one thread: the environments one after the other
+  - ours: as it comes, in threads or one environment after the other, whichever it finds faster
+  - threads: always in as many threads
+  - one thread: always one after the other
 
 `--clock cpu` counts the time that the processor worked for this process instead of the time on
 the wall: for a machine that does other things as well. Threads are always timed on the wall.
@@ -247,6 +248,7 @@ def thread_rows(name: str, arguments: argparse.Namespace) -> list[dict[str, Any]
     steps = np.full(cores, arguments.steps, np.uint32)
     simulators = {
         'ours': Simulator(run, settings, 'sim'),
+        'threads': Simulator(run, settings, 'sim', threads=cores),
         'one thread': Simulator(run, settings, 'sim', threads=1),
     }
     works = {who: simulator.work() for who, simulator in simulators.items()}
@@ -298,8 +300,8 @@ TABLES = {
     'action': ('Actions, one observation at a time', ('ours', 'module', 'numpy'), ('module',)),
     'threads': (
         'Several environments: a step of any of them',
-        ('ours', 'one thread'),
-        ('one thread',),
+        ('ours', 'threads', 'one thread'),
+        ('threads', 'one thread'),
     ),
 }
 """For each kind of row: its title, whose times are shown, and what ours are compared with."""

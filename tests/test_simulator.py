@@ -23,7 +23,7 @@ from codetr_ros.records import (
     TrueRewards,
 )
 from codetr_ros.seeding import generator, seed_torch
-from codetr_ros.simulator import Simulator
+from codetr_ros.simulator import Simulator, ThreadChoice
 from codetr_ros.source import CHUNK_BYTES, CHUNK_STEPS, chunk_steps
 
 FALLS = 'InvertedPendulum-v5'  # within some ten steps under the random policy
@@ -382,6 +382,19 @@ def test_threads_change_no_bit_and_no_order(task):
     for a, b in zip(alone, together, strict=True):
         assert all(map(same, deterministic(a), deterministic(b)))
         assert len(a) == len(b)
+
+
+def test_threads_are_used_where_they_are_faster_and_tried_again_now_and_then():
+    choice, cost, used = ThreadChoice(), {True: 3.0, False: 1.0}, []
+    for number in range(400):
+        if number == 200:  # from now on another policy acts, say
+            cost = {True: 1.0, False: 2.0}
+        used.append(choice.threads())
+        choice.note(used[-1], cost[used[-1]])
+    before, after = used[:200], used[200 + ThreadChoice.TRY_AGAIN :]
+    assert {True, False} == set(used[:2])
+    assert 0 < before.count(True) <= 200 / ThreadChoice.TRY_AGAIN + 2
+    assert 0 < after.count(False) <= len(after) / ThreadChoice.TRY_AGAIN + 2
 
 
 @pytest.mark.parametrize('task', [FALLS, NEVER_ENDS])

@@ -127,8 +127,11 @@ class Environment(ABC):
         return observation, reward, terminated
 
     def _check(self, observation: F32) -> None:
+        # takes a fifth of the time of a look at each, and is not finite where one of them is not
+        if math.isfinite(observation.dot(observation)):
+            return
         finite = np.isfinite(observation)
-        if 0 in finite.tobytes():  # a third of the time that `all` takes
+        if not finite.all():  # else it was the sum of squares that overflowed
             i = int(np.argmin(finite))
             raise TaskError(self._not_finite(f'observation[{i}]', observation[i]))
 

@@ -65,6 +65,7 @@ class Episode:
         self.observation: F32 = np.zeros(environment.observation_size, np.float32)
         self.length = 0
         self._first_step = 0  # of the segment that runs
+        self._due = 0  # length at which it is to be scored, unless the episode ends before
         self._composite_return = 0.0
 
     @property
@@ -77,7 +78,11 @@ class Episode:
         self.observation = self._environment.reset(seed)
         self.terminated = self.truncated = False
         self.length = self._first_step = 0
+        self._due = self._end_of_segment()
         self._composite_return = 0.0
+
+    def _end_of_segment(self) -> int:
+        return min(self._first_step + self._settings.delay, self._environment.horizon)
 
     def step(self, action: F32) -> tuple[float, Score | None]:
         """Take an action (A,) in [-1, 1].
@@ -93,16 +98,15 @@ class Episode:
         self.observation, reward, self.terminated = self._environment.step(action)
         self._rewards[self.length] = reward
         self.length += 1
-        self.truncated = self.length == self._environment.horizon and not self.terminated
-        first, length = self._first_step, self.length - self._first_step
-        settings = self._settings
-        if length < settings.delay and not self.over:
+        if self.length < self._due and not self.terminated:
             return reward, None
+        self.truncated = self.length == self._environment.horizon and not self.terminated
+        first, settings = self._first_step, self._settings
         segment = self._rewards[first : self.length]
-        score = Score(
-            first, length, composite(settings.composite, segment, settings.beta, settings.delay)
-        )
+        value = composite(settings.composite, segment, settings.beta, settings.delay)
+        score = Score(first, len(segment), value)
         self._first_step = self.length
+        self._due = self._end_of_segment()
         self._composite_return += score.value
         return reward, score
 

@@ -1,14 +1,14 @@
 """A simulator: rolls out the steps that each policy permits and says what happened."""
 
-import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import torch
 
+from codetr_ros import processors
 from codetr_ros.config import Settings
 from codetr_ros.learners.network import ActingPolicy
 from codetr_ros.records import (
@@ -35,15 +35,17 @@ class Simulator:
     environments have in common is the process, the policy and the turn: a slice is one chunk of
     each, one after the other in the order of their names.
 
-    Their chunks are rolled out in threads, as many as there are processors: MuJoCo releases the
-    interpreter lock while it steps, and PyTorch while it multiplies. No source shares with another
-    anything that changes, so that threads change no bit.
+    Their chunks are rolled out in threads, as many as there are processors, where that is faster:
+    MuJoCo releases the interpreter lock while it steps, and PyTorch while it multiplies, but where
+    their parts are short threads wait for each other. No source shares with another anything that
+    changes, so that threads change no bit.
 
     Args:
         run: the run it belongs to.
         settings: the settings of the run.
         name: its name, which must differ from every other simulator's of the run.
-        threads: how many at the most; as many as there are processors where None.
+        threads: how many, always; where None as many as there are processors, or none, whichever
+            is faster.
 
     Raises:
         TaskError: the task is unknown or cannot be used.
@@ -64,13 +66,14 @@ class Simulator:
         self._counters: Counter[str] = Counter()
         self._closed = False
         self.finished = False
-        workers = min(len(self._sources), threads or len(os.sched_getaffinity(0)))
+        workers = min(len(self._sources), threads or processors.count())
         self._pool = (
             # torch keeps its number of threads for each thread that calls it
             ThreadPoolExecutor(workers, 'env', torch.set_num_threads, (settings.threads,))
             if workers > 1
             else None
         )
+        self._choice = ThreadChoice() if threads is None else None
 
     def receive(self, record: Record) -> None:
         """Keep a policy until its phase's turn.
@@ -125,11 +128,12 @@ class Simulator:
         ]
         seconds = 0.0
         while going:
-            began = time.perf_counter()
-            chunks = list(self._map(next, going))
-            seconds += time.perf_counter() - began
+            chunks, spent = self._chunks(going)
+            seconds += spent
             going = [
-                rollout for rollout, said in zip(going, chunks, strict=True) if not _last(said)
+                rollout
+                for rollout, said in zip(going, chunks, strict=True)
+                if not _chunk(said).phase_end
             ]
             records = [record for said in chunks for record in said]
             if not going:
@@ -137,15 +141,18 @@ class Simulator:
                 records.append(self._metrics(policy.phase, seconds))
             yield records
 
-    def _map(
-        self,
-        work: Callable[[Iterator[list[Record]]], list[Record]],
-        rollouts: list[Iterator[list[Record]]],
-    ) -> Iterator[list[Record]]:
-        """The records of each, in order, computed in threads where there are any."""
-        if self._pool is None or len(rollouts) == 1:
-            return map(work, rollouts)
-        return self._pool.map(work, rollouts)
+    def _chunks(self, going: list[Iterator[list[Record]]]) -> tuple[list[list[Record]], float]:
+        """The next records of each, in order, and the seconds that they took."""
+        pool = self._pool if len(going) > 1 else None
+        choice = None if pool is None else self._choice
+        if choice is not None and not choice.threads():
+            pool = None
+        began = time.perf_counter()
+        chunks = list(map(next, going) if pool is None else pool.map(next, going))
+        spent = time.perf_counter() - began
+        if choice is not None:
+            choice.note(pool is not None, spent / sum(_chunk(said).steps for said in chunks))
+        return chunks, spent
 
     def _metrics(self, phase: int, seconds: float) -> Metrics:
         step = self._settings.steps_after(phase)
@@ -169,8 +176,30 @@ class Simulator:
         return {'lost': {}, 'duplicated': {}, 'counters': dict(counters)}
 
 
-def _last(said: list[Record]) -> bool:
-    """Whether these are the records of a source's last chunk of the phase."""
+class ThreadChoice:
+    """Whether to use threads: whatever was faster when it was last tried, and now and then the
+    other, since what is faster changes with the policy and with what else the machine does.
+    """
+
+    TRY_AGAIN = 32  # slices
+
+    def __init__(self) -> None:
+        self._seconds = {True: 0.0, False: 0.0}  # per step, by threads or none; 0: to be tried
+        self._slices = 0
+
+    def threads(self) -> bool:
+        """Whether the next slice is to use them."""
+        self._slices += 1
+        faster = self._seconds[True] <= self._seconds[False]
+        return faster != (self._slices % self.TRY_AGAIN == 0)
+
+    def note(self, threads: bool, seconds: float) -> None:
+        """Keep how many seconds a step has taken, with threads or without."""
+        self._seconds[threads] = seconds
+
+
+def _chunk(said: list[Record]) -> Transitions:
+    """The chunk among what a source said: the first record."""
     chunk = said[0]
     assert isinstance(chunk, Transitions)
-    return chunk.phase_end
+    return chunk

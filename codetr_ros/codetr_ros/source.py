@@ -25,7 +25,7 @@ from codetr_ros.tasks import TaskError, make, r_max
 CHUNK_BYTES = 200_000
 """Most bytes of a chunk: the middleware's shared-memory segment holds 512 KB."""
 CHUNK_STEPS = 250
-"""Most steps of a chunk: bounds how long a slice of work takes, so how quickly a node answers."""
+"""Most steps of a chunk: bounds how long an environment's part of a slice of work takes."""
 
 
 def chunk_steps(observation_size: int, action_size: int) -> int:
