@@ -9,6 +9,7 @@ from devices import ACTION, OBSERVATION, Run, needs_gpu
 
 from codetr_ros.learners import device_memory
 from codetr_ros.learners.device_memory import DeviceMemory
+from codetr_ros.learners.learner import LearnerError
 
 DISCOUNT = 0.9
 DEVICES = ['cpu', pytest.param('cuda', marks=needs_gpu)]
@@ -118,6 +119,16 @@ def test_the_same_seed_draws_the_same_steps_and_the_next_draw_others():
     assert not torch.equal(first, second)
     torch.manual_seed(1)
     assert torch.equal(steps.draw(32), first)
+
+
+def test_a_device_without_room_says_how_much_is_wanted_and_what_to_lower():
+    run = Run()
+    run.filled()
+    for ring in run.memory.sources:
+        ring.capacity = 1 << 50
+    message = r'device=cpu: no room for \d{16} steps of \d+ bytes.* lower memory_steps'
+    with pytest.raises(LearnerError, match=message):
+        mirror(run).update()
 
 
 def test_a_row_takes_the_bytes_it_states():

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from codetr_ros.learners.learner import LearnerError
 from codetr_ros.source_ring import SourceRing
 from codetr_ros.trajectories import Trajectories
 
@@ -59,10 +60,22 @@ class DeviceMemory:
         return stayed
 
     def _allocate(self, rings: list[SourceRing]) -> None:
+        """Make room for all that the sources' rings can hold.
+
+        Raises:
+            LearnerError: the device has not got it.
+        """
         size = sum(ring.capacity for ring in rings)
         width = 2 * self.memory.observation_size + self.memory.action_size + 2
-        self.rows = torch.full((size, width), torch.nan, device=self._device)
-        self._labelled = torch.zeros(size, dtype=torch.int64, device=self._device)
+        try:
+            self.rows = torch.full((size, width), torch.nan, device=self._device)
+            self._labelled = torch.zeros(size, dtype=torch.int64, device=self._device)
+        except RuntimeError as error:  # torch's own where a GPU is out of memory
+            raise LearnerError(
+                f'device={self._device}: no room for {size} steps of {4 * width + 8} bytes, '
+                f'memory_steps for each of {len(rings)} environments: lower memory_steps, '
+                f'simulators or envs, or set device=cpu. torch said: {error}'
+            ) from error
         self._count = torch.zeros((), dtype=torch.int64, device=self._device)
         self._copied = [0] * len(rings)
 

@@ -1,4 +1,4 @@
-"""The update of `sac.SAC` made fast on a CPU: gradients by hand, weights in a few flat tensors.
+"""The update of `sac.SAC` made fast: gradients by hand, weights in a few flat tensors.
 
 All parameters of one optimiser lie in one tensor, Adam's moments likewise, so that a step of Adam
 or of the targets is one call; what others know as weights and moments are views of these. One pass
@@ -12,6 +12,7 @@ and biases (N, 1, out), one after the other; its activations are (N, B, H).
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -112,11 +113,14 @@ class FlatSAC(SAC):
     def _learn(self, batch: StepBatch, updates: int) -> None:
         """Updates, each from its share of the batch, in order."""
         # Copies, in memory of torch's own: how an array lies can change the last bit of a product.
-        s, a, r = map(torch.tensor, (batch.observations, batch.actions, batch.rewards))
-        s2, terminated = map(torch.tensor, (batch.next_observations, batch.terminated))
+        own = partial(torch.tensor, device=self._sums.device)
+        s, a, r = map(own, (batch.observations, batch.actions, batch.rewards))
+        s2, terminated = map(own, (batch.next_observations, batch.terminated))
         going_on = self.discount * (1 - terminated.to(r.dtype))
         # the numbers that updates one by one would draw, where B A is a multiple of 8
-        noise = torch.randn(updates, 2, len(a) // updates, a.shape[1], dtype=a.dtype)
+        noise = torch.randn(
+            updates, 2, len(a) // updates, a.shape[1], dtype=a.dtype, device=a.device
+        )
         shares = (part.view(updates, -1, *part.shape[1:]) for part in (s, a, r, s2, going_on))
         for share in zip(*shares, noise, strict=True):
             self._step(*share)

@@ -17,7 +17,9 @@ from codetr_ros.trajectories import Trajectories
 
 
 class LearnerError(ValueError):
-    """A policy learner that has diverged or cannot be restored: names value, field and remedy."""
+    """A policy learner that has diverged, cannot be restored or lacks its device: names value,
+    field and remedy.
+    """
 
 
 class PolicyLearner(Protocol):
