@@ -42,8 +42,12 @@ def main(arguments: Sequence[str]) -> int:
     folder = Path(given.run_dir)
     try:
         settings = run_folder.read_settings(folder)
-        # the policy of a run that learnt on a GPU needs none
-        changes: dict[str, int | str] = {'evaluate_every': 1, 'device': 'cpu'}
+        # to read a policy needs neither the GPU that it was learnt on nor a compiler
+        changes: dict[str, int | str] = {
+            'evaluate_every': 1,
+            'device': 'cpu',
+            'sac.compile': False,
+        }
         if given.episodes is not None:
             changes['evaluate_episodes'] = given.episodes
         if given.seed is not None:
