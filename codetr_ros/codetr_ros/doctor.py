@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
-from codetr_ros import compilation
+from codetr_ros import compilation, processors
 from codetr_ros.records import PROTOCOL_VERSION
 from codetr_ros.summary import version_of
 
@@ -175,8 +175,8 @@ def torch() -> list[Check]:
         return [Check('torch', 'fail', f'cannot be imported: {error}', _INSTALL)]
     threads = os.environ.get('OMP_NUM_THREADS')
     said = f', OMP_NUM_THREADS={threads}' if threads else ''
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count()
-    found = f'{module.__version__}, {module.get_num_threads()} threads on {cores} cores{said}'
+    threads_now, cores = module.get_num_threads(), processors.count()
+    found = f'{module.__version__}, {threads_now} threads on {cores} cores{said}'
     checks = [Check('torch', 'ok', f'{found} (`codetr train` sets its own: --threads)')]
     if module.cuda.is_available():
         name = module.cuda.get_device_name()

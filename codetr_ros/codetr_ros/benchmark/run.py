@@ -1,9 +1,9 @@
 """Running a benchmark: what is still to be done, done, with an overview."""
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
+from codetr_ros import processors
 from codetr_ros.benchmark import pool, ray_pool
 from codetr_ros.benchmark.attempt import Job
 from codetr_ros.benchmark.folder import Folder, session
@@ -78,18 +78,17 @@ def _todo(spec: Spec, folder: Folder, retry_failed: bool) -> tuple[list[Job], di
         if state == 'failed' and not retry_failed:
             failed[cell.name] = folder.error(cell.name)
         elif state != 'finished':
-            jobs.append(
-                Job(cell.name, settings.hash(), settings.steps, settings.phases, settings.threads)
-            )
+            threads = max(settings.threads, min(settings.envs, processors.count()))
+            jobs.append(Job(cell.name, settings.hash(), settings.steps, settings.phases, threads))
     return jobs, failed
 
 
 def _warn(jobs: list[Job], workers: int, overview: Overview) -> None:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count()
+    cores = processors.count()
     threads = max((job.threads for job in jobs), default=1)
-    if cores is not None and workers * threads > cores:
+    if workers * threads > cores:
         overview.say(
             f'{workers} workers with {threads} threads each on {cores} cores: they will wait for '
-            'each other; give fewer --workers, or lower config.threads in the spec',
+            'each other; give fewer --workers, or lower config.threads or config.envs in the spec',
             'yellow',
         )
