@@ -251,7 +251,7 @@ class Processes:
         return [node for node in self.nodes if node.code is None]
 
     def failed(self) -> Node | None:
-        """The first that ended without having saved everything and was not told to."""
+        """The first that ended with an error and was not told to end."""
         return next((node for node in self.nodes if node.unasked_failure), None)
 
     def stop(self) -> None:

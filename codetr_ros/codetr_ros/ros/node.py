@@ -6,7 +6,8 @@ in slices.
 Nothing is learnt in a callback and no thread spins beside the learner. A node answers (signals,
 parameters, its presence) between two slices, so within the length of one: `sac.burst` updates in
 the learner, one gradient step or the labels of some hundred segments in the reward node, one chunk
-in a simulator, one episode in the evaluator. While it waits it answers within 50 ms.
+of each environment in a simulator, one episode in the evaluator. While it waits it answers within
+50 ms.
 """
 
 import gc
@@ -32,7 +33,8 @@ from codetr_ros.ros.signals import Stop
 
 ACK_DEADLINE = 5.0  # [s] at the end for readers that have not everything yet
 STOPPED_DEADLINE = 0.1  # [s] the same when the process was asked to stop
-SHUTDOWN_DEADLINE = 20  # [s] for the middleware to let go, once everything is saved and said
+SHUTDOWN_DEADLINE = 8  # [s] for the middleware to let go, once everything is saved and said:
+# well before `launcher.STOP_DEADLINE`, which counts from the signal on
 LAST_WORDS = 5  # times that the last presence is said: so many make the middleware ask for answers
 
 
@@ -131,7 +133,10 @@ class CoreNode(Joining):
         if self.stop.signal and not error and not finished:
             self.log.info(f'stopped by {self.stop.signal.name}')
         code = 1 if error else 0
-        self.stop.end_within(SHUTDOWN_DEADLINE, code)
+        try:
+            self.stop.end_within(SHUTDOWN_DEADLINE, code)
+        except OSError as problem:
+            self.log.warning(f'nothing will end this process if its middleware hangs: {problem}')
         self.let_go()
         return code
 

@@ -8,6 +8,7 @@ bytes that were recorded; only where a live learner announces a run of its own a
 anew, under its id.
 """
 
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
@@ -252,6 +253,7 @@ class PlayNode(Played, CoreNode):
             print(
                 f'{self.left} messages of {" and ".join(self._live)} were left to the live nodes'
             )
+        sys.stdout.flush()  # nobody else does if the middleware hangs now
 
     def _goodbye(self) -> None:
         for other in self._others:
