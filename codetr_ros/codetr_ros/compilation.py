@@ -1,4 +1,4 @@
-"""Compiling torch functions for this processor: they become C++, and a C++ compiler builds it.
+"""Compiling torch functions for this processor or its GPU, with what a C++ compiler builds.
 
 What was built is kept and found again by the next run, in `cache_folder()`. This module imports
 torch only when something is compiled, so that `codetr doctor` can ask what is missing.
@@ -80,8 +80,10 @@ def compiled(function: _Function, example: Sequence[Any], without: str) -> _Func
         result(*example)
     except TorchDynamoException as error:
         said = str(error).split('Set TORCHDYNAMO_VERBOSE')[0].strip()
+        device = example[0].device.type
+        remedy = REMEDY if device == 'cpu' else f'see below what it needs for device={device}'
         raise CompilationError(
-            f'torch could not compile {function.__qualname__}: {REMEDY}, or set {without}. '
+            f'torch could not compile {function.__qualname__}: {remedy}, or set {without}. '
             f'It said: {said[-2000:]}'
         ) from error
     return result

@@ -129,7 +129,10 @@ class CodetrSettings(Group):
         True, description='standardise observations by warm-up mean and deviation (decided here)'
     )
     label_batch: int = Field(
-        256, ge=1, le=65536, description='segments or windows labelled in one pass'
+        256,
+        ge=1,
+        le=65536,
+        description='segments or windows labelled between two looks at arriving messages',
     )
     precision: Literal['float32', 'bfloat16'] = Field(
         'float32',
@@ -246,9 +249,9 @@ class SacSettings(Group):
     )
     compile: bool = Field(
         True,
-        description='compile the update for this processor: faster, but needs a C++ compiler, and '
-        'the first start takes about half a minute more, later ones some seconds (what was '
-        'compiled is kept in ~/.cache/codetr_ros/torch)',
+        description='compile the update for this processor, or the GPU of `device`: faster, but '
+        'needs a C++ compiler, and the first start takes about half a minute more, later ones '
+        'some seconds (what was compiled is kept in ~/.cache/codetr_ros/torch)',
     )
 
 
@@ -350,7 +353,7 @@ class Settings(Group):
         ge=1,
         le=64,
         description='environments of each simulator, among which its steps are divided; they are '
-        'stepped in threads, as many as there are processors',
+        'stepped in threads, as many as there are processors, where that is faster',
     )
     memory_steps: int = Field(
         1_000_000, ge=1, le=10**9, description='steps that the memory D holds'
@@ -384,8 +387,8 @@ class Settings(Group):
     )
     record_relabels: Literal['first', 'all'] = Field(
         'first',
-        description='labels in the bag: the first of each segment and all at evaluations, or '
-        'every one',
+        description='labels in the bag: the first of each segment and, at evaluations, all that '
+        'the phase gave, or every one',
     )
     threads: int = Field(1, ge=1, le=256, description='torch threads of each process')
     device: str = Field(

@@ -53,7 +53,7 @@ class Recorded:
     Attributes:
         run: what it was announced as.
         settings: its settings.
-        sources: names of its simulators.
+        sources: names of its sources.
         phases: how many were committed; the run may have been meant to have more.
     """
 

@@ -38,7 +38,9 @@ class Recovery:
 
     @property
     def whole(self) -> bool:
-        """Whether nothing is missing but what a killed recorder had not finished."""
+        """Whether nothing is missing but what a killed recorder had not finished, as far as the
+        numbers of what there is and the disk can tell.
+        """
         return self.verdict is not None and self.verdict.sound and not self.unread
 
     def note(self, damage: Damage) -> None:

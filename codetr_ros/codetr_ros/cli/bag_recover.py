@@ -83,7 +83,9 @@ def show(report: Mapping[str, Any], console: Console) -> None:
                 f'run {run["run_id"]!r} in {run["namespace"]}: {upto}, '
                 f'{run["phases_committed"]} phases were committed'
             )
+    unread = report['unread']
     say(
         f'{report["new"]}: {report["messages"]} messages, {report["bytes"]} bytes kept; '
         f'{report["bytes_lost"]} bytes of {report["old"]} could not be read'
+        + (f', and the disk gives nothing in {unread} places' if unread else '')
     )

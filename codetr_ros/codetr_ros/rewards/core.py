@@ -149,7 +149,7 @@ class Labeller(Consumer):
     ) -> Iterator[list[StepRewards]]:
         """Label what is new, and of what has changed as much as `relabel_steps` says.
 
-        A slice is one forward pass.
+        A slice is `label_batch` segments.
         """
         self._ages.follow(memory.segment_ids())
         todo = self._ages.due(method.version, memory.lengths, self._settings.relabel_steps)

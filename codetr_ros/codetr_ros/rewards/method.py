@@ -32,8 +32,8 @@ class RewardMethod(ABC):
     """One way of making step rewards. Algorithm 1 knows reward methods by this class only.
 
     In each phase that is learnt from it calls `prepare`, then `gradient_step` as often as
-    `schedule` says, then `label_passes`, of all segments where `version` has risen and of the new
-    ones otherwise.
+    `schedule` says, then `label_passes`: where `version` has risen of all segments, or of those
+    with the oldest labels (`relabel_steps`), and of the new ones in any case.
 
     Labels are in the unit that `settings.reward_unit` asks for: in units of the target scale c
     (`scaled`), or as the task gives them (`raw`).
