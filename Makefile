@@ -3,7 +3,7 @@
 PYTHON ?= python3
 VENV := .venv
 ARGS ?=
-BENCH ?= simulator sac_updates codetr_speed nodes throughput recording_overhead bags growth memory
+BENCH ?= simulator sac_updates codetr_speed nodes throughput recording_overhead bags growth memory whole_runs
 
 # A shell in which another ROS or another environment is sourced must not mix with this one: its packages would be
 # imported before ours, and the wheels search the directories of LD_LIBRARY_PATH in no fixed order.
@@ -16,7 +16,7 @@ help:
 	@echo "make train    set up what is missing, then learn the default task and watch it    (codetr train)"
 	@echo "make test     set up what is missing, then run all tests, lint and types included (pytest)"
 	@echo "make lint     lint, format and type checks alone"
-	@echo "make bench    measure how fast everything is, some two hours on a machine that does nothing else (benchmarks/)"
+	@echo "make bench    measure how fast everything is, some three hours on a machine that does nothing else (benchmarks/)"
 	@echo "make format   put the code into the house format"
 	@echo "make setup    the set-up alone, into $(VENV)"
 	@echo "make clean    remove $(VENV) and every cache; runs are kept"
