@@ -95,6 +95,7 @@ def test_a_state_that_is_not_finite_is_refused():
         environment.step(np.zeros(2, np.float32))
 
 
+@pytest.mark.filterwarnings('ignore:overflow')
 def test_large_but_finite_observations_are_taken():
     environment = make('Reacher-v5')
     environment.reset(0)

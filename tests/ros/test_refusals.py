@@ -54,7 +54,7 @@ def test_other_nodes_refuse_the_run_of_such_a_method_before_they_open_a_topic(pl
 
 
 def test_a_reward_node_refuses_a_run_whose_learner_takes_the_scores_itself(play):
-    play = play(settings=tiny(method='hc'))
+    play = play(settings=tiny(method='hc'), roles=('learner', 'sim'))
     with process('reward') as node:
         play.until(lambda: node.poll() is not None)
         said = output(node)
