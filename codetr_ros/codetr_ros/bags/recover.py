@@ -81,20 +81,14 @@ def recover(old: Path | str, new: Path | str) -> Recovery:
     """
     found = Recovery(Path(old), Path(new))
     bag = Bag(found.old, found.note)
-    try:
-        with unfinished(found.new) as folder:
-            copied = copy(bag.raw(), folder, f'recovered by {LIBRARY}')
-            found.messages, found.bytes = copied.messages, copied.bytes
-            if not copied.files:
-                raise BagError(
-                    f'no message of {old} can be read, {new} is not made: '
-                    + (found.said[0].text if found.said else 'it holds none')
-                )
-            describe(copied, folder)
-    except OSError as error:
-        raise BagError(
-            f'{new} cannot be written: {error.strerror}. Nothing of it is left: make room, and '
-            f'recover {old} again'
-        ) from error
+    with unfinished(found.new, f'recover {old} again') as folder:
+        copied = copy(bag.raw(), folder, f'recovered by {LIBRARY}')
+        found.messages, found.bytes = copied.messages, copied.bytes
+        if not copied.files:
+            raise BagError(
+                f'no message of {old} can be read, {new} is not made: '
+                + (found.said[0].text if found.said else 'it holds none')
+            )
+        describe(copied, folder)
     found.verdict = verify(found.new)
     return found

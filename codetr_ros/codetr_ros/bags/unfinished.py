@@ -7,23 +7,37 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from codetr_ros.bags.errors import BagError
+from codetr_ros.bags.errors import BagError, BagWriteError
 from codetr_ros.bags.metadata import METADATA
 from codetr_ros.run_folder import sync_folder
 
 
 @contextmanager
-def unfinished(folder: Path) -> Iterator[Path]:
+def unfinished(folder: Path, again: str) -> Iterator[Path]:
     """A folder of the same name to write a bag in; what it holds then is moved to where it
     belongs, or is removed after an error. One that is killed leaves `.NAME.*.unfinished`.
 
     Args:
         folder: where the bag belongs: does not exist, or is empty.
+        again: what to do once there is room, such as 'label again'.
 
     Raises:
-        BagError: it holds something.
-        OSError: it cannot be made or written.
+        BagError: it holds something, or cannot be made or written.
     """
+    try:
+        with _moved_when_whole(folder) as new:
+            yield new
+    except (BagWriteError, OSError) as error:
+        reason = error.__cause__ if isinstance(error, BagWriteError) else error
+        assert isinstance(reason, OSError)
+        raise BagError(
+            f'{folder} cannot be written: {reason.strerror}. Nothing of it is left: make room, '
+            f'and {again}'
+        ) from error
+
+
+@contextmanager
+def _moved_when_whole(folder: Path) -> Iterator[Path]:
     target = Path(os.path.realpath(folder))
     if target.exists() and (there := sorted(path.name for path in target.iterdir())):
         raise BagError(

@@ -5,7 +5,6 @@ from contextlib import closing
 from pathlib import Path
 
 from codetr_ros.bags.definitions import encode
-from codetr_ros.bags.errors import BagError, BagWriteError
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.topics import BagTopic
 from codetr_ros.bags.unfinished import unfinished
@@ -34,18 +33,11 @@ def convert(bag: Bag, rules: Mapping, folder: Path) -> Conversion:
             f'{bag.path} has no topic {", ".join(missing)}. It has: {", ".join(bag.topics)}'
         )
     made = Converter(rules, folder.name)
-    try:
-        with unfinished(folder) as new:
-            _write(_records(bag, rules, made), rules.source, new)
-            if not made.found.steps:
-                lost = ', '.join(f'{n} {what}' for what, n in made.found.dropped.items())
-                raise FitError(f'{bag.path}: not one step could be made: {lost or "no command"}')
-    except (BagWriteError, OSError) as error:
-        reason = error.__cause__ if isinstance(error, BagWriteError) else error
-        raise BagError(
-            f'{folder} cannot be written: {reason}. Nothing of it is left: make room, and convert '
-            'again'
-        ) from error
+    with unfinished(folder, 'convert again') as new:
+        _write(_records(bag, rules, made), rules.source, new)
+        if not made.found.steps:
+            lost = ', '.join(f'{n} {what}' for what, n in made.found.dropped.items())
+            raise FitError(f'{bag.path}: not one step could be made: {lost or "no command"}')
     return made.found
 
 

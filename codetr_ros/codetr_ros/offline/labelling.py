@@ -66,16 +66,10 @@ def label(bag: Bag, saved: SavedModel, folder: Path, memory_steps: int) -> Label
     method = restore(saved, settings, index.observation_size, index.action_size)
     found = stretches(index, settings.delay, min(STRETCH_STEPS, max(1, memory_steps // 4)))
     made = Labelled(unlabelled=found.unscored, skipped=found.skipped)
-    try:
-        messages = _messages(bag, index, method, found.found, memory_steps, made)
-        with unfinished(folder) as new:
-            copied = copy(messages, new, f'labelled by {LIBRARY}')
-            describe(copied, new)
-    except OSError as error:
-        raise BagError(
-            f'{folder} cannot be written: {error.strerror}. Nothing of it is left: make room, and '
-            'label again'
-        ) from error
+    messages = _messages(bag, index, method, found.found, memory_steps, made)
+    with unfinished(folder, 'label again') as new:
+        copied = copy(messages, new, f'labelled by {LIBRARY}')
+        describe(copied, new)
     return made
 
 
