@@ -1,6 +1,7 @@
 import shutil
 import subprocess
 import sys
+import tempfile
 import textwrap
 import tracemalloc
 from dataclasses import replace
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from bags.making import WRITERS, a_run, ours, topic_of
 from builders import same
+from disks import fill, small_disk
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -272,3 +274,14 @@ def test_a_bag_in_a_folder_with_a_strange_name_is_read(tmp_path):
     strange = tmp_path / 'what? #1 50%'
     shutil.move(made, strange)
     assert len(read(strange)) == len(a_run())
+
+
+def test_a_full_temporary_disk_is_no_damage_of_the_bag(tmp_path, monkeypatch):
+    bag = WRITERS['rosbags-mcap-zstd-file'](tmp_path / 'bag', a_run())
+    with small_disk(tmp_path / 'disk', 1) as disk:
+        fill(disk)
+        monkeypatch.setattr(tempfile, 'tempdir', str(disk))
+        damage = []
+        with pytest.raises(BagError, match=r'unpacked, cannot be written: No space.*set TMPDIR'):
+            list(Bag(bag, damage.append).raw())
+    assert not damage

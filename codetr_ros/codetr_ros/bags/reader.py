@@ -9,7 +9,7 @@ the caller asks to be told of faults and to go on (`on_damage`).
 import tempfile
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -268,16 +268,24 @@ def _write(pieces: Iterable[bytes], path: Path) -> None:
     Raises:
         BagError: it cannot be written; errors of what is read pass through.
     """
-    with path.open('wb') as file:
+    with _writing(path):
+        file = path.open('wb')
+    with file:
         for piece in pieces:
-            try:
+            with _writing(path):
                 file.write(piece)
                 file.flush()
-            except OSError as error:
-                raise BagError(
-                    f'{path}, to which a bag is unpacked, cannot be written: {error.strerror}: '
-                    'make room there, or set TMPDIR to a folder that has some'
-                ) from error
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise BagError(
+            f'{path}, to which a bag is unpacked, cannot be written: {error.strerror}: make room '
+            'there, or set TMPDIR to a folder that has some'
+        ) from error
 
 
 def _decompressed(data: bytes | memoryview) -> bytes:
