@@ -10,7 +10,6 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 from rich.table import Table
-from rich.text import Text
 
 from codetr_ros import run_folder
 from codetr_ros.cli import refuse
@@ -43,7 +42,7 @@ def main(arguments: Sequence[str]) -> int:
     if given.json:
         print(json.dumps(found, indent=2, allow_nan=False))
     else:
-        show(found, Console())
+        show(found, Console(markup=False))  # names in a bag may look like it
     return 0
 
 
@@ -60,7 +59,6 @@ def show(found: Mapping[str, Any], console: Console) -> None:
             f'\n{found["faults"]} faults were read past: `codetr bag verify {found["bag"]}` names '
             'them',
             style='yellow',
-            markup=False,
             highlight=False,
         )
 
@@ -72,47 +70,41 @@ def _pairs() -> Table:
     return table
 
 
-def _row(table: Table, *cells: str) -> None:
-    """Add a row of plain text: names in a bag may look like markup."""
-    table.add_row(*map(Text, cells))
-
-
 def _bag(found: Mapping[str, Any]) -> Table:
     table = _pairs()
-    _row(table, 'bag', found['bag'])
+    table.add_row('bag', found['bag'])
     for file in found['files']:
-        _row(table, 'file', f'{file["name"]}, {file["bytes"] / 1e6:.2f} MB')
+        table.add_row('file', f'{file["name"]}, {file["bytes"] / 1e6:.2f} MB')
     first, last = found['first_ns'], found['last_ns']
     if first is not None:
         began = datetime.fromtimestamp(first / 1e9, timezone.utc)
-        _row(table, 'recorded', f'{began:%Y-%m-%d %H:%M:%S} UTC, {(last - first) / 1e9:.1f} s')
+        table.add_row('recorded', f'{began:%Y-%m-%d %H:%M:%S} UTC, {(last - first) / 1e9:.1f} s')
     return table
 
 
 def _run(run: Mapping[str, Any]) -> Table:
     table = _pairs()
-    _row(table, 'run', f'{run["run_id"]} in {run["namespace"]}')
+    table.add_row('run', f'{run["run_id"]} in {run["namespace"]}')
     for name, value in run['settings'].items():
-        _row(table, 'steps planned' if name == 'steps' else name, str(value))
+        table.add_row('steps planned' if name == 'steps' else name, str(value))
     for name, source in run['sources'].items():
-        _row(
-            table,
+        table.add_row(
             f'source {name}',
             f'{source["task"] or "no task announced"}: {source["observation_size"]} observations, '
             f'{source["action_size"]} actions, {source["steps"]} steps in {source["chunks"]} '
             f'chunks, {source["episodes"]} episodes ({source["terminated"]} terminated, '
             f'{source["truncated"]} truncated)',
         )
-    _row(table, 'segments scored', f'{run["segments_scored"]}, {run["steps_scored"]} steps')
-    _row(table, 'scores', _span(run['scores']))
-    _row(table, 'phases committed', _whole_span(run['phases']))
-    _row(table, 'policy versions', _whole_span(run['policy_versions']))
-    _row(table, 'reward model versions', _whole_span(run['model_versions']))
-    _row(table, 'labels', str(run['labels']))
+    table.add_row('segments scored', f'{run["segments_scored"]}, {run["steps_scored"]} steps')
+    table.add_row('scores', _span(run['scores']))
+    table.add_row('phases committed', _whole_span(run['phases']))
+    table.add_row('policy versions', _whole_span(run['policy_versions']))
+    table.add_row('reward model versions', _whole_span(run['model_versions']))
+    table.add_row('labels', str(run['labels']))
     if run['evaluations']:
         step, last = list(run['evaluations'].items())[-1]
         text = f'{len(run["evaluations"])}, true return at step {step}: {_span(last)}'
-        _row(table, 'evaluations', text)
+        table.add_row('evaluations', text)
     return table
 
 
@@ -139,5 +131,5 @@ def _topics(topics: Mapping[str, Any]) -> Table:
     table.add_column('MB', justify='right')
     for name, topic in topics.items():
         kind = topic['type'].removeprefix('codetr_msgs/msg/')
-        _row(table, name, kind, str(topic['messages']), f'{topic["bytes"] / 1e6:.2f}')
+        table.add_row(name, kind, str(topic['messages']), f'{topic["bytes"] / 1e6:.2f}')
     return table

@@ -8,7 +8,6 @@ from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
-from rich.markup import escape
 
 from codetr_ros import run_folder
 from codetr_ros.cli import FAILED, refuse
@@ -53,7 +52,8 @@ def main(arguments: Sequence[str]) -> int:
     if given.json:
         print(json.dumps(found.report(), indent=2, allow_nan=False))
     else:
-        show(found.report(), Console(soft_wrap=True))
+        # names in a bag may look like markup
+        show(found.report(), Console(soft_wrap=True, markup=False))
     return 0 if found.whole else FAILED
 
 
@@ -61,7 +61,7 @@ def show(report: Mapping[str, Any], console: Console) -> None:
     """Print what became of the bag."""
 
     def say(text: str) -> None:
-        console.print(escape(text), highlight=False)
+        console.print(text, highlight=False)
 
     for loss in report['losses'][:SHOWN]:
         lost = f' ({loss["bytes"]} bytes lost)' if loss['bytes'] else ''

@@ -49,7 +49,8 @@ def main(arguments: Sequence[str]) -> int:
     if given.json:
         print(json.dumps(verdict.report(), indent=2, allow_nan=False))
     else:
-        show(verdict.report(), given.limit, Console(soft_wrap=True))
+        # names in a bag may look like markup
+        show(verdict.report(), given.limit, Console(soft_wrap=True, markup=False))
     return 0 if verdict.sound else FAILED
 
 
@@ -60,19 +61,19 @@ def show(report: Mapping[str, Any], limit: int, console: Console) -> None:
         shown[finding['kind']] += 1
         if shown[finding['kind']] <= limit:
             text = f'{finding["kind"]}: {finding["place"]}: {finding["text"]}'
-            console.print(text, markup=False, highlight=False)
+            console.print(text, highlight=False)
     for kind, count in report['found'].items():
         if (more := count - min(shown[kind], limit)) > 0:  # of very many not all are named
-            console.print(f'{kind}: {more} more', markup=False, highlight=False)
+            console.print(f'{kind}: {more} more', highlight=False)
     for remark in report['remarks']:
-        console.print(f'note: {remark}', markup=False, highlight=False)
+        console.print(f'note: {remark}', highlight=False)
     for run in report['runs']:
         committed, whole = run['phases_committed'], run['phases_whole']
         if committed:
             text = f'run {run["run_id"]!r} in {run["namespace"]}: {committed} phases committed'
             last = f', whole up to phase {whole - 1}' if whole else ', none of them whole'
             text += ', all whole' if whole == committed else last
-            console.print(text, markup=False, highlight=False)
+            console.print(text, highlight=False)
     total = sum(report['found'].values())
     if total:
         kinds = ', '.join(f'{count} {kind}' for kind, count in report['found'].items())
@@ -81,9 +82,8 @@ def show(report: Mapping[str, Any], limit: int, console: Console) -> None:
             f'messages. `codetr bag recover {report["bag"]} --out NEW` makes a whole bag of what '
             'can be read',
             style='red',
-            markup=False,
             highlight=False,
         )
     else:
         text = f'{report["bag"]}: sound, {report["messages"]} messages'
-        console.print(text, style='green', markup=False)
+        console.print(text, style='green')
