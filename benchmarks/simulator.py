@@ -34,7 +34,6 @@ the wall: for a machine that does other things as well. Threads are always timed
 
 import argparse
 import csv
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -48,7 +47,7 @@ import numpy as np
 import torch
 
 import machine
-from codetr_ros import tasks
+from codetr_ros import processors, tasks
 from codetr_ros.config import Settings
 from codetr_ros.learners.network import (
     ActingPolicy,
@@ -238,7 +237,7 @@ def action_rows(name: str, arguments: argparse.Namespace) -> list[dict[str, Any]
 
 def thread_rows(name: str, arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """All rounds of a simulator with several environments."""
-    cores = len(os.sched_getaffinity(0))
+    cores = processors.count()
     settings = Settings(task=name, envs=cores)
     environment = tasks.make(name)
     sizes = environment.observation_size, environment.action_size

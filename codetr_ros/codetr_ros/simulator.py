@@ -73,7 +73,7 @@ class Simulator:
             if workers > 1
             else None
         )
-        self._choice = ThreadChoice() if threads is None else None
+        self._choice = ThreadChoice() if self._pool is not None and threads is None else None
 
     def receive(self, record: Record) -> None:
         """Keep a policy until its phase's turn.
@@ -143,15 +143,15 @@ class Simulator:
 
     def _chunks(self, going: list[Iterator[list[Record]]]) -> tuple[list[list[Record]], float]:
         """The next records of each, in order, and the seconds that they took."""
-        pool = self._pool if len(going) > 1 else None
-        choice = None if pool is None else self._choice
-        if choice is not None and not choice.threads():
-            pool = None
+        several = len(going) > 1
+        choice = self._choice if several else None
+        threads = several if choice is None else choice.threads()
+        pool = self._pool if threads else None
         began = time.perf_counter()
         chunks = list(map(next, going) if pool is None else pool.map(next, going))
         spent = time.perf_counter() - began
         if choice is not None:
-            choice.note(pool is not None, spent / sum(_chunk(said).steps for said in chunks))
+            choice.note(threads, spent / sum(_chunk(said).steps for said in chunks))
         return chunks, spent
 
     def _metrics(self, phase: int, seconds: float) -> Metrics:
