@@ -1,7 +1,7 @@
 """The house style is kept: lint, format and types, as `make lint` checks them."""
 
 import ast
-import importlib
+import importlib.util
 import subprocess
 import sys
 from pathlib import Path

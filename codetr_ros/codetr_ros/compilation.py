@@ -1,4 +1,4 @@
-"""Compiling torch functions for this processor or its GPU, with what a C++ compiler builds.
+"""Compiling torch functions for this processor, with its C++ compiler, or for its GPU.
 
 What was built is kept and found again by the next run, in `cache_folder()`. This module imports
 torch only when something is compiled, so that `codetr doctor` can ask what is missing.
