@@ -1,18 +1,25 @@
-"""Which reading of the paper learns better? CoDeTr's open switches, by return and by recovery.
+"""What do CoDeTr's switches do to what is learnt? By return and by reward recovery.
 
-    .venv/bin/python benchmarks/ablations.py run --out runs/ablations --workers 2
-    .venv/bin/python benchmarks/ablations.py table --out runs/ablations
+    .venv/bin/python benchmarks/ablations.py run readings --workers 2       # twenty minutes
+    .venv/bin/python benchmarks/ablations.py table readings
+    .venv/bin/python benchmarks/ablations.py run savings --workers 2        # half an hour
+    .venv/bin/python benchmarks/ablations.py table savings
 
-The paper leaves open which scalar becomes the step reward, how attention within the sequence is
-scaled, in which unit composite rewards are fitted, how far back the causal transformer sees, and
-whether segments or windows are labelled. `run` trains on one task under each reading, three seeds
-each, as cells of `codetr benchmark run` (resumable like any benchmark); `table` writes the final
-returns and how well step rewards were recovered at the last evaluation to
-`benchmarks/results/ablations.csv` and `.md`.
+Two studies, each on one task, with every variant under the same seeds, as cells of `codetr
+benchmark run` (resumable like any benchmark). `table` writes the final returns and how well step
+rewards were recovered at the last evaluation to `benchmarks/results/`:
 
-Reacher-v5 with a score every 10 of its 50 steps, which is their sum or their soft maximum: 8000
-steps of it take half a minute, and every step of it has a reward of its own, so that credit
-matters and survival means nothing.
+`readings` (`ablations.csv`, `.md`): which reading of the paper learns better? It leaves open which
+scalar becomes the step reward, how attention within the sequence is scaled, in which unit
+composite rewards are fitted, how far back the causal transformer sees, and whether segments or
+windows are labelled. On Reacher-v5 with a score every 10 of its 50 steps, which is their sum or
+their soft maximum: 8000 steps of it take half a minute, and every step of it has a reward of its
+own, so that credit matters and survival means nothing.
+
+`savings` (`savings.csv`, `.md`): what do the switches that save time cost? Labelling again only a
+part of the memory in each phase (`relabel_steps`), and products in bfloat16. On HalfCheetah-v5
+with sums of 25 steps, 30 000 of them. For each variant the steps labelled, and the age of labels
+at the end: gradient steps taken since a step was labelled, mean over the memory and the oldest.
 """
 
 import argparse
@@ -21,64 +28,129 @@ import json
 import statistics
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-TASK, DELAY, STEPS, SEEDS = 'Reacher-v5', 10, 8000, (0, 1, 2)
-COMPOSITES = ('sum', 'max')
 RESULTS = Path(__file__).parent / 'results'
-READINGS: dict[str, dict[str, Any]] = {
-    'as shipped (quick)': {},
-    'label rhat': {'codetr.label': 'rhat'},
-    'weights one': {'codetr.weights': 'one'},
-    'head scale 1/sqrt(d)': {'codetr.head_scale': 'inverse_sqrt'},
-    'head scale one': {'codetr.head_scale': 'one'},
-    'initialisation lecun': {'codetr.initialisation': 'lecun'},
-    'target scale none': {'target_scale': 'none'},
-    'context episode': {'codetr.context': 'episode', 'codetr.window': 50},
-    'label windows': {'codetr.labelling': 'window', 'codetr.window': 50},
-    'label windows, rhat': {
-        'codetr.labelling': 'window',
-        'codetr.window': 50,
-        'codetr.label': 'rhat',
+COLUMNS = ('composite', 'variant', 'seed', 'final_return', 'pearson', 'within')
+SAVED = ('steps_labelled', 'label_age_mean', 'label_age_max')
+"""Of these `steps_labelled` is summed over phases, the others are those of the last."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """Variants of one method's settings on one task.
+
+    Args:
+        file: the results' name.
+        task: the task.
+        delay: steps from score to score.
+        steps: of each run.
+        seeds: of each variant.
+        composites: composite rewards.
+        config: what all variants have in common.
+        variants: what each one changes, by name.
+        references: methods beside which the variants are put.
+        saved: whether what labelling took is told.
+    """
+
+    file: str
+    task: str
+    delay: int
+    steps: int
+    seeds: tuple[int, ...]
+    composites: tuple[str, ...]
+    config: dict[str, Any]
+    variants: dict[str, dict[str, Any]]
+    references: tuple[str, ...] = ()
+    saved: bool = False
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Columns of the results."""
+        return (*COLUMNS, *(SAVED if self.saved else ()), 'wall_s', 'commit')
+
+    def benchmarks(self) -> dict[str, dict[str, Any]]:
+        """Every benchmark's specification by the name of its folder."""
+        found = {
+            _slug(name): self._specification(['codetr'], changes)
+            for name, changes in self.variants.items()
+        }
+        if self.references:
+            found['references'] = self._specification(list(self.references), {})
+        return found
+
+    def _specification(self, methods: list[str], changes: dict[str, Any]) -> dict[str, Any]:
+        return {
+            'methods': methods,
+            'tasks': [self.task],
+            'composites': list(self.composites),
+            'delays': [self.delay],
+            'seeds': list(self.seeds),
+            'steps': self.steps,
+            'config': {**self.config, **changes},
+        }
+
+
+READINGS = Study(
+    file='ablations',
+    task='Reacher-v5',
+    delay=10,
+    steps=8000,
+    seeds=(0, 1, 2),
+    composites=('sum', 'max'),
+    config={'base': 'quick', 'evaluate_every': 2000},
+    variants={
+        'as shipped (quick)': {},
+        'label rhat': {'codetr.label': 'rhat'},
+        'weights one': {'codetr.weights': 'one'},
+        'head scale 1/sqrt(d)': {'codetr.head_scale': 'inverse_sqrt'},
+        'head scale one': {'codetr.head_scale': 'one'},
+        'initialisation lecun': {'codetr.initialisation': 'lecun'},
+        'target scale none': {'target_scale': 'none'},
+        'context episode': {'codetr.context': 'episode', 'codetr.window': 50},
+        'label windows': {'codetr.labelling': 'window', 'codetr.window': 50},
+        'label windows, rhat': {
+            'codetr.labelling': 'window',
+            'codetr.window': 50,
+            'codetr.label': 'rhat',
+        },
+        'pair tokens': {'codetr.tokens': 'pair'},
     },
-    'pair tokens': {'codetr.tokens': 'pair'},
-}
-REFERENCES = ('none', 'uniform', 'true')
-"""Methods beside which the readings are put."""
-COLUMNS = ('composite', 'reading', 'seed', 'final_return', 'pearson', 'within', 'wall_s', 'commit')
-
-
-def spec(methods: list[str], changes: dict[str, Any]) -> dict[str, Any]:
-    """A benchmark's specification."""
-    return {
-        'methods': methods,
-        'tasks': [TASK],
-        'composites': list(COMPOSITES),
-        'delays': [DELAY],
-        'seeds': list(SEEDS),
-        'steps': STEPS,
-        'config': {'base': 'quick', 'evaluate_every': 2000, **changes},
-    }
-
-
-def benchmarks() -> dict[str, dict[str, Any]]:
-    """Every benchmark by the name of its folder."""
-    found = {_slug(name): spec(['codetr'], changes) for name, changes in READINGS.items()}
-    return found | {'references': spec(list(REFERENCES), {})}
+    references=('none', 'uniform', 'true'),
+)
+SAVINGS = Study(
+    file='savings',
+    task='HalfCheetah-v5',
+    delay=25,
+    steps=30_000,
+    seeds=(0, 1, 2, 3, 4),
+    composites=('sum',),
+    config={'base': 'quick', 'warmup_steps': 1000, 'evaluate_every': 5000},
+    variants={
+        'all labelled again, float32 (quick)': {},
+        'relabel_steps 10 000': {'relabel_steps': 10_000},
+        'relabel_steps 3000': {'relabel_steps': 3000},
+        'relabel_steps 1000': {'relabel_steps': 1000},
+        'precision bfloat16': {'codetr.precision': 'bfloat16'},
+    },
+    saved=True,
+)
+STUDIES = {'readings': READINGS, 'savings': SAVINGS}
 
 
 def _slug(name: str) -> str:
     return ''.join(c if c.isalnum() else '_' for c in name)
 
 
-def run(out: Path, workers: int) -> int:
+def run(study: Study, out: Path, workers: int) -> int:
     """Run what has not been run."""
     out.mkdir(parents=True, exist_ok=True)
     code = 0
-    for name, data in benchmarks().items():
+    for name, data in study.benchmarks().items():
         path = out / f'{name}.yaml'
         path.write_text(yaml.safe_dump(data, sort_keys=False))
         command = [sys.executable, '-m', 'codetr_ros.cli', 'benchmark', 'run', str(path)]
@@ -87,54 +159,69 @@ def run(out: Path, workers: int) -> int:
     return code
 
 
-def rows(out: Path) -> list[dict[str, Any]]:
+def rows(study: Study, out: Path) -> list[dict[str, Any]]:
     """What the finished runs have shown."""
-    names = {_slug(name): name for name in READINGS} | {'references': ''}
+    names = {_slug(name): name for name in study.variants} | {'references': ''}
     found = []
     for slug, name in names.items():
         for path in sorted((out / slug).glob('*/summary.json')):
             summary = json.loads(path.read_text())
             recovered = (summary.get('reward_recovery') or [{}])[-1]
             ending = json.loads((out / slug / 'cells' / f'{path.parent.name}.json').read_text())
-            found.append(
-                {
-                    'composite': summary['composite'],
-                    'reading': name or f'method {summary["method"]}',
-                    'seed': summary['seed'],
-                    'final_return': summary['evaluations'][-1]['true_return_mean'],
-                    'pearson': recovered.get('pearson'),
-                    'within': recovered.get('within'),
-                    'wall_s': summary['wall_s'],
-                    'commit': ending.get('commit'),
-                }
-            )
-    return sorted(found, key=lambda row: COMPOSITES.index(row['composite']))
+            row = {
+                'composite': summary['composite'],
+                'variant': name or f'method {summary["method"]}',
+                'seed': summary['seed'],
+                'final_return': summary['evaluations'][-1]['true_return_mean'],
+                'pearson': recovered.get('pearson'),
+                'within': recovered.get('within'),
+                'wall_s': summary['wall_s'],
+                'commit': ending.get('commit'),
+            }
+            found.append(row | (labelling(path.with_name('metrics.csv')) if study.saved else {}))
+    return sorted(found, key=lambda row: study.composites.index(row['composite']))
 
 
-def table(out: Path) -> None:
+def labelling(metrics: Path) -> dict[str, float]:
+    """What labelling took in a run, by the reward side's metrics."""
+    with metrics.open() as file:
+        said = list(csv.DictReader(file))
+    found: dict[str, float] = {}
+    for name in SAVED:
+        values = [float(cell) for row in said if (cell := row.get(f'reward.{name}'))]
+        found[name] = sum(values) if name == 'steps_labelled' else values[-1]
+    return found
+
+
+def table(study: Study, out: Path) -> None:
     """Write every run as CSV and the means over seeds as Markdown."""
-    found = rows(out)
-    with (RESULTS / 'ablations.csv').open('w', newline='') as file:
-        writer = csv.DictWriter(file, COLUMNS)
+    found = rows(study, out)
+    with (RESULTS / f'{study.file}.csv').open('w', newline='') as file:
+        writer = csv.DictWriter(file, study.columns)
         writer.writeheader()
         writer.writerows(found)
+    means = ('pearson', 'within', *(SAVED if study.saved else ()))
     lines = [
-        f'{TASK}, delay {DELAY}, {STEPS} steps, preset quick: return of the last evaluation '
-        '(10 episodes), by seed, and correlation of inferred and true step rewards then.',
+        f'{study.task}, delay {study.delay}, {study.steps} steps, preset quick: return of the '
+        'last evaluation (10 episodes), by seed, and correlation of inferred and true step '
+        'rewards then.',
         '',
-        '| composite | reading | seeds | final return | by seed | Pearson | within segments |',
-        '|---|---|---:|---:|---|---:|---:|',
+        '| composite | variant | seeds | final return | spread | by seed | '
+        f'{" | ".join(means).replace("_", " ")} |',
+        f'|---|---|---:|---:|---:|---|{"---:|" * len(means)}',
     ]
-    for composite, reading in dict.fromkeys((row['composite'], row['reading']) for row in found):
-        mine = [row for row in found if (row['composite'], row['reading']) == (composite, reading)]
+    for composite, variant in dict.fromkeys((row['composite'], row['variant']) for row in found):
+        mine = [row for row in found if (row['composite'], row['variant']) == (composite, variant)]
         returns = [row['final_return'] for row in mine]
-        cells = [composite, reading, str(len(mine)), f'{statistics.mean(returns):.2f}']
+        cells = [composite, variant, str(len(mine)), f'{statistics.mean(returns):.2f}']
+        cells.append(f'{statistics.stdev(returns):.2f}' if len(mine) > 1 else '')
         cells.append(', '.join(f'{value:.2f}' for value in returns))
-        for column in ('pearson', 'within'):
+        for column in means:
             values = [row[column] for row in mine if row[column] is not None]
-            cells.append(f'{statistics.mean(values):.2f}' if values else '')
+            digits = 0 if column in SAVED else 2
+            cells.append(f'{statistics.mean(values):.{digits}f}' if values else '')
         lines.append(f'| {" | ".join(cells)} |')
-    (RESULTS / 'ablations.md').write_text('\n'.join(lines) + '\n')
+    (RESULTS / f'{study.file}.md').write_text('\n'.join(lines) + '\n')
     print('\n'.join(lines))
 
 
@@ -144,12 +231,14 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument('what', choices=['run', 'table'])
-    parser.add_argument('--out', type=Path, default=Path('runs/ablations'))
+    parser.add_argument('study', choices=list(STUDIES))
+    parser.add_argument('--out', type=Path, default=Path('runs'), help='folder of the studies')
     parser.add_argument('--workers', type=int, default=1)
     arguments = parser.parse_args()
+    study, out = STUDIES[arguments.study], arguments.out / STUDIES[arguments.study].file
     if arguments.what == 'run':
-        return run(arguments.out, arguments.workers)
-    table(arguments.out)
+        return run(study, out, arguments.workers)
+    table(study, out)
     return 0
 
 

@@ -45,7 +45,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -192,8 +192,10 @@ def per_run(settings: Settings) -> dict[str, float]:
 # whole runs
 
 
-def whole_run(flags: list[str], in_process: bool) -> dict[str, float]:
-    """One run by the command that users have; its times [s]."""
+def whole_run(
+    flags: list[str], in_process: bool, environment: Mapping[str, str] | None = None
+) -> dict[str, float]:
+    """One run by the command that users have, in an environment; its times [s]."""
     with tempfile.TemporaryDirectory() as folder:
         out, marks = Path(folder, 'run'), Path(folder, 'marks.json')
         command = ['train', *flags, '--out', str(out)]
@@ -208,6 +210,7 @@ def whole_run(flags: list[str], in_process: bool) -> dict[str, float]:
             stderr=subprocess.STDOUT,
             text=True,
             check=False,
+            env=environment,
         )
         spent = time.monotonic() - began
         if done.returncode:

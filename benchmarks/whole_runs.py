@@ -11,19 +11,25 @@ The run is `codetr train`, over topics, with the flags behind `--`: by default t
   - else: the rest of the run, such as messages on their way, checkpoints, the last evaluation
 Evaluation works beside the loop, in a process of its own, and competes for the cores.
 
-Writes `results/whole_runs.md` and `.csv`. To compare, run it at both commits with another `--out`.
+Writes `results/whole_runs.md` and `.csv`. To compare with another state of this program, check
+that out elsewhere, and run it with the same packages:
+
+    .venv/bin/python benchmarks/whole_runs.py --checkout /tmp/earlier --out whole_runs_before
 """
 
 import argparse
 import csv
+import os
+import subprocess
 import sys
 from pathlib import Path
 
 import machine
 import throughput
 
-RESULTS = Path(__file__).parent / 'results' / 'whole_runs'
+RESULTS = Path(__file__).parent / 'results'
 PACKAGES = ('numpy', 'torch', 'mujoco')
+LIBRARIES = ('codetr_ros', 'sim_node', 'reward_node', 'learner_node')
 
 
 def stages(found: dict[str, float]) -> dict[str, float]:
@@ -32,19 +38,36 @@ def stages(found: dict[str, float]) -> dict[str, float]:
     return {'start': found['start'], **work, 'else': found['rest'] - sum(work.values())}
 
 
+def environment(checkout: Path) -> dict[str, str]:
+    """The variables with which Python finds a checkout's packages before those installed."""
+    folders = [str(checkout / name) for name in LIBRARIES]
+    others = filter(None, [os.environ.get('PYTHONPATH')])
+    return os.environ | {'PYTHONPATH': os.pathsep.join([*folders, *others])}
+
+
+def commit(checkout: Path) -> str:
+    """The commit that is checked out."""
+    command = ['git', '-C', str(checkout), 'rev-parse', '--short', 'HEAD']
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+
 def main() -> int:
     """The command line; the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument('--out', type=Path, default=RESULTS, help='without its suffix')
+    parser.add_argument('--out', default='whole_runs', help='name of the results')
+    parser.add_argument('--checkout', type=Path, help='run the program that is checked out there')
     parser.add_argument('flags', nargs='*', default=['--config', 'cpu'], metavar='FLAG')
     arguments = parser.parse_args()
     facts = machine.facts(machine.load(), PACKAGES)
-    found = throughput.whole_run(arguments.flags, in_process=False)
+    variables = None
+    if arguments.checkout:
+        facts['commit of the run'] = commit(arguments.checkout)
+        variables = environment(arguments.checkout.absolute())
+    found = throughput.whole_run(arguments.flags, in_process=False, environment=variables)
     seconds, wall = stages(found), found['wall']
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    with arguments.out.with_suffix('.csv').open('w', newline='') as file:
+    with (RESULTS / f'{arguments.out}.csv').open('w', newline='') as file:
         writer = csv.writer(file)
         writer.writerow(['stage', 'seconds'])
         writer.writerows(
@@ -61,7 +84,7 @@ def main() -> int:
     lines += [f'- {name}: {fact}' for name, fact in facts.items()]
     lines.append(f'- run: codetr train {" ".join(arguments.flags)}')
     text = '\n'.join(lines) + '\n'
-    arguments.out.with_suffix('.md').write_text(text)
+    (RESULTS / f'{arguments.out}.md').write_text(text)
     print(text)
     return 0
 
