@@ -10,11 +10,11 @@ from test_sac import same
 
 from codetr_ros import checkpoints, in_process
 from codetr_ros.config import SacSettings
+from codetr_ros.devices import DeviceError, usable
 from codetr_ros.learners import methods
-from codetr_ros.learners.device_sac import WARM_UP_CALLS, DeviceSAC, usable
+from codetr_ros.learners.device_sac import WARM_UP_CALLS, DeviceSAC
 from codetr_ros.learners.flat_sac import FlatSAC
 from codetr_ros.learners.from_labels import FromLabelsOnDevice
-from codetr_ros.learners.learner import LearnerError
 from codetr_ros.learners.network import weights_bytes
 
 torch.set_num_threads(1)  # a second thread is slower at these sizes
@@ -198,7 +198,7 @@ def test_a_run_with_its_memory_on_a_device_finishes_and_its_checkpoint_loads(
 @pytest.mark.skipif(torch.cuda.is_available(), reason='there is a GPU here')
 @pytest.mark.parametrize('device', ['cuda', 'cuda:1'])
 def test_a_gpu_that_is_not_here_is_said_before_anything_is_simulated(device):
-    with pytest.raises(LearnerError, match=f'device={device}: torch .* or set device=cpu'):
+    with pytest.raises(DeviceError, match=f'device={device}: torch .* or set device=cpu'):
         in_process.run(tiny(device=device), 'run')
 
 
@@ -209,7 +209,7 @@ def test_a_gpu_that_is_not_here_is_said_before_anything_is_simulated(device):
 @needs_gpu
 def test_a_gpu_that_is_beyond_the_last_one_is_refused_with_the_last_ones_name():
     count = torch.cuda.device_count()
-    with pytest.raises(LearnerError, match=f'the last is cuda:{count - 1}'):
+    with pytest.raises(DeviceError, match=f'the last is cuda:{count - 1}'):
         usable(f'cuda:{count}')
 
 

@@ -394,8 +394,13 @@ class Settings(Group):
     device: str = Field(
         'cpu',
         pattern=r'^(cpu|cuda(:\d{1,2})?)$',
-        description='where SAC learns: cpu, or the GPU cuda, cuda:1, ... of the learner; all else '
-        'runs on the CPU',
+        description='where SAC learns: cpu, or the GPU cuda, cuda:1, ... of the learner',
+    )
+    reward_device: str = Field(
+        'cpu',
+        pattern=r'^(cpu|cuda(:\d{1,2})?)$',
+        description='where a reward model with a network learns and labels: cpu, or the GPU cuda, '
+        'cuda:1, ... of the reward node; all else runs on the CPU',
     )
     codetr: CodetrSettings = Field(
         default_factory=CodetrSettings, description='the reward transformer'

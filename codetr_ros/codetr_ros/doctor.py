@@ -180,7 +180,7 @@ def torch() -> list[Check]:
     checks = [Check('torch', 'ok', f'{found} (`codetr train` sets its own: --threads)')]
     if module.cuda.is_available():
         name = module.cuda.get_device_name()
-        checks.append(Check('GPU', 'ok', f'{name}; SAC learns on it with device=cuda'))
+        checks.append(Check('GPU', 'ok', f'{name}: device=cuda, reward_device=cuda'))
     else:
         checks.append(Check('GPU', 'ok', 'none that torch can use; device=cpu needs none'))
     return checks

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 from builders import score, transitions
 from offline.bag_making import message, write, write_messages
 from test_saved_models import trained
@@ -194,3 +195,10 @@ def test_times_that_a_message_cannot_say_are_refused_by_name(a_run, fitted, tmp_
     label(old, fitted, tmp_path / 'new', code=2)
     assert 'StepRewards cannot be written' in capsys.readouterr().err
     assert [p.name for p in tmp_path.iterdir()] == ['old'], 'nothing unfinished is left'
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason='there is a GPU here')
+def test_a_device_that_is_not_here_is_said_and_nothing_is_written(a_run, fitted, tmp_path, capsys):
+    new = label(a_run.bag, fitted, tmp_path / 'new', '--reward-device=cuda', code=1)
+    assert 'reward_device=cuda: torch' in capsys.readouterr().err
+    assert not new.exists()

@@ -120,13 +120,14 @@ def main(arguments: Sequence[str]) -> int:
     except (SettingsError, RunFolderError) as error:
         return refuse(str(error))
     from codetr_ros.checkpoints import CheckpointError
+    from codetr_ros.devices import DeviceError
     from codetr_ros.rewards import RewardModelError
 
     try:
         return (_phases if given.fit.schedule == 'phases' else _epochs)(arguments, given)
     except (SettingsError, RunFolderError, FitError, BagError, CheckpointError) as error:
         return refuse(str(error))
-    except RewardModelError as error:
+    except (RewardModelError, DeviceError) as error:
         print(f'codetr: {error}', file=sys.stderr)
         return FAILED
 

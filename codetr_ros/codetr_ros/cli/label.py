@@ -37,6 +37,13 @@ class Arguments:
     memory_steps: Annotated[
         int, tyro.conf.arg(metavar='N', help='steps that are held in memory at a time')
     ] = 1_000_000
+    reward_device: Annotated[
+        str,
+        tyro.conf.arg(
+            metavar='DEVICE',
+            help='where the model labels, wherever it has learnt: cpu, cuda, cuda:1, ...',
+        ),
+    ] = 'cpu'
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -45,16 +52,20 @@ def main(arguments: Sequence[str]) -> int:
     if given.memory_steps < 1:
         return refuse(f'--memory-steps {given.memory_steps}: at least 1 step must be held')
     from codetr_ros.checkpoints import CheckpointError
+    from codetr_ros.devices import DeviceError
     from codetr_ros.offline import labelling, sources
     from codetr_ros.rewards import RewardModelError, saved
 
     try:
         (bag,) = sources.open_bags([Path(given.bag)])
         model = saved.read(Path(given.checkpoint))
+        where = {'reward_device': given.reward_device}
+        settings = model.settings.changed(where, 'command line')
+        model = dataclasses.replace(model, settings=settings)
         made = labelling.label(bag, model, Path(given.out), given.memory_steps)
     except (BagError, CheckpointError, FitError, RecordError, SettingsError) as error:
         return refuse(str(error))
-    except RewardModelError as error:
+    except (RewardModelError, DeviceError) as error:
         print(f'codetr: {error}', file=sys.stderr)
         return FAILED
     console = Console(highlight=False, soft_wrap=True)

@@ -10,9 +10,9 @@ import torch
 from codetr_ros import checkpoints
 from codetr_ros.config import Settings
 from codetr_ros.consumer import Consumer
+from codetr_ros.devices import usable
 from codetr_ros.intake import check_run
 from codetr_ros.learners import methods, network
-from codetr_ros.learners.device_sac import usable
 from codetr_ros.learners.learner import PolicyLearner
 from codetr_ros.records import (
     INITIAL_VERSION,
@@ -41,7 +41,7 @@ class Learner(Consumer):
         folder: where checkpoints go; None keeps none.
 
     Raises:
-        LearnerError: the device of the settings is not here.
+        DeviceError: the device of the settings is not here.
     """
 
     role = 'learner'

@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from codetr_ros.config import SacSettings
+from codetr_ros.devices import usable
 from codetr_ros.learners.device_memory import DeviceMemory, columns
 from codetr_ros.learners.flat_sac import FlatSAC
-from codetr_ros.learners.learner import LearnerError
 from codetr_ros.trajectories import Trajectories
 
 Call: TypeAlias = Callable[[], None]
@@ -40,7 +40,7 @@ class DeviceSAC(FlatSAC):
             meanwhile, of which nothing remains. None: `cuda_graph` on a GPU, else nothing.
 
     Raises:
-        LearnerError: there is no such device here.
+        DeviceError: there is no such device here.
     """
 
     def __init__(
@@ -122,28 +122,3 @@ def cuda_graph(call: Call) -> Call:
     with torch.cuda.graph(graph, stream=stream):
         call()
     return graph.replay
-
-
-def usable(device: str) -> torch.device:
-    """A device by its name, once it is certain that torch can use it.
-
-    Raises:
-        LearnerError: it cannot; says why, and what to do.
-    """
-    wanted = torch.device(device)
-    if wanted.type == 'cpu':
-        return wanted
-    remedy = 'or set device=cpu'
-    if not torch.cuda.is_available():
-        if torch.version.cuda is None and torch.version.hip is None:
-            why, do = 'was built without CUDA', 'Install a build with it from pytorch.org'
-        else:
-            why, do = 'finds no GPU', 'See what nvidia-smi says and CUDA_VISIBLE_DEVICES hides'
-        raise LearnerError(f'device={device}: torch {torch.__version__} {why}. {do}, {remedy}')
-    count, index = torch.cuda.device_count(), wanted.index or 0
-    if index >= count:
-        raise LearnerError(
-            f'device={device}: torch finds {count} GPUs, the last is cuda:{count - 1}. '
-            f'Name one of them, {remedy}'
-        )
-    return torch.device('cuda', index)

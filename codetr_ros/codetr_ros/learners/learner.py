@@ -17,8 +17,8 @@ from codetr_ros.trajectories import Trajectories
 
 
 class LearnerError(ValueError):
-    """A policy learner that has diverged, cannot be restored or lacks its device: names value,
-    field and remedy.
+    """A policy learner that has diverged, cannot be restored or lacks room: names value, field and
+    remedy.
     """
 
 

@@ -22,7 +22,7 @@ def make(settings: Settings, observation_size: int, action_size: int) -> PolicyL
         action_size: A of the task.
 
     Raises:
-        LearnerError: the device of the settings is not here.
+        DeviceError: the device of the settings is not here.
     """
     from_labels = FromLabels if settings.device == 'cpu' else FromLabelsOnDevice
     learner = METHODS.get(settings.method, from_labels)

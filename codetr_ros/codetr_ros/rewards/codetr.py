@@ -56,7 +56,7 @@ class Codetr(SequenceMethod):
         with torch.inference_mode():
             parts = [self.network(*self._inputs(part)) for part in self._parts(batch)]
         outside = ~segment_steps(batch)
-        w, rhat = (torch.cat(each).numpy() for each in zip(*parts, strict=True))
+        w, rhat = (torch.cat(each).cpu().numpy() for each in zip(*parts, strict=True))
         w[outside] = 0  # with a window's scope the context has weights too
         rhat[outside] = 0
         return w, rhat
@@ -76,7 +76,7 @@ class Codetr(SequenceMethod):
         batch = memory.sample_segments(rng, self._codetr.batch, self.context)
         for part in self._parts(batch):
             weights, rewards = self.network(*self._inputs(part))  # (b, L) each
-            inside = torch.from_numpy(segment_steps(part))
+            inside = self._put(segment_steps(part))
             predicted = (weights * rewards * inside).sum(1)  # (b,)
             error = F.mse_loss(predicted, self._scaled(part.values), reduction='sum')
             yield {'reward_loss': error / len(batch.values)}

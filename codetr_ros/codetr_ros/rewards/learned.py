@@ -3,13 +3,15 @@
 import math
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from codetr_ros.config import CodetrSettings, PerceptronSettings, Settings
+from codetr_ros.devices import usable
 from codetr_ros.records import F32, F64
 from codetr_ros.rewards.method import (
     RewardMethod,
@@ -42,6 +44,12 @@ class Learned(RewardMethod):
 
     A subclass says what its network is, which terms its loss is the sum of, and which step
     rewards it reads off.
+
+    The network lies on `device`, that of the setting `reward_device`; batches are made on the CPU
+    and copied there, labels come back. A state loads on any device.
+
+    Raises:
+        DeviceError: there is no such device here.
     """
 
     group: ClassVar[str]
@@ -56,10 +64,12 @@ class Learned(RewardMethod):
     def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
         super().__init__(settings, observation_size, action_size)
         self._own: CodetrSettings | PerceptronSettings = getattr(settings, self.group)
-        self._mean = torch.zeros(observation_size)
-        self._std = torch.ones(observation_size)
+        self.device = usable(settings.reward_device, 'reward_device')
+        self._mean = torch.zeros(observation_size, device=self.device)
+        self._std = torch.ones(observation_size, device=self.device)
         seed_torch(settings.seed, self.name, 'init')
-        self.network = self._make_network(observation_size, action_size)
+        # drawn on the CPU: the same initial weights on each device
+        self.network = self._make_network(observation_size, action_size).to(self.device)
         self._optimiser = torch.optim.AdamW(
             self.network.parameters(),
             lr=self._own.learning_rate,
@@ -69,7 +79,7 @@ class Learned(RewardMethod):
         for parameter in self.network.parameters():
             # from the start, so that every state has the same tensors
             self._optimiser.state[parameter] = {
-                'step': torch.zeros(()),
+                'step': torch.zeros((), device=self.device),
                 'exp_avg': torch.zeros_like(parameter),
                 'exp_avg_sq': torch.zeros_like(parameter),
             }
@@ -108,8 +118,8 @@ class Learned(RewardMethod):
         super().prepare(memory)
         if self._own.normalise_observations:
             mean, std = memory.observation_moments()
-            self._mean = torch.tensor(mean, dtype=torch.float32)
-            self._std = torch.tensor(np.maximum(std, STD_FLOOR), dtype=torch.float32)
+            self._mean = self._put(mean.astype(np.float32))
+            self._std = self._put(np.maximum(std, STD_FLOOR).astype(np.float32))
 
     def gradient_step(self, memory: Trajectories, rng: np.random.Generator) -> dict[str, float]:
         """One AdamW step on the loss of a batch.
@@ -159,21 +169,25 @@ class Learned(RewardMethod):
         self._require_prepared()
         self.network.eval()
         with torch.inference_mode():
-            parts = [self._step_rewards(part).numpy() for part in self._parts(batch)]
+            parts = [self._step_rewards(part).cpu().numpy() for part in self._parts(batch)]
         rewards: F32 = np.concatenate(parts)
         rewards[~segment_steps(batch)] = 0
         return rewards
 
-    def _standardised(self, observations: F32) -> Tensor:
+    def _put(self, values: NDArray[Any]) -> Tensor:
+        """An array of any shape as a tensor on the device."""
         # torch.tensor copies into aligned memory: nothing may depend on where numpy's is
-        standardised = (torch.tensor(observations) - self._mean) / self._std
+        return torch.tensor(values).to(self.device)
+
+    def _standardised(self, observations: F32) -> Tensor:
+        standardised = (self._put(observations) - self._mean) / self._std
         if self._own.normalise_observations:
             return standardised.clamp(-self.clip, self.clip)
         return standardised
 
     def _scaled(self, values: F64) -> Tensor:
         """Composite rewards (B,) in units of c."""
-        return torch.tensor(values / self.target_scale, dtype=torch.float32)
+        return self._put((values / self.target_scale).astype(np.float32))
 
     def state(self) -> dict[str, Tensor]:
         """Weights, AdamW moments, gradient steps taken, target scale and observation moments."""

@@ -34,13 +34,13 @@ class Mlp(Learned):
         self, memory: Trajectories, rng: np.random.Generator
     ) -> Iterator[dict[str, Tensor]]:
         batch = memory.sample_segments(rng, self._settings.mlp.batch)
-        inside = torch.from_numpy(segment_steps(batch))  # (B, L)
+        inside = self._put(segment_steps(batch))  # (B, L)
         predicted = (self._step_rewards(batch) * inside).sum(1)  # (B,)
         yield {'reward_loss': F.mse_loss(predicted, self._scaled(batch.values))}
 
     def _step_rewards(self, batch: SegmentBatch) -> Tensor:
         observations = self._standardised(batch.observations[:, :-1])  # (B, L, O)
-        inputs = torch.cat([observations, torch.tensor(batch.actions)], -1)  # (B, L, O + A)
+        inputs = torch.cat([observations, self._put(batch.actions)], -1)  # (B, L, O + A)
         rewards: Tensor = self.network(inputs).squeeze(-1)  # (B, L)
         return rewards
 

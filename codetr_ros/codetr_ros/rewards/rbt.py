@@ -79,10 +79,10 @@ class Rbt(SequenceMethod):
         windows = memory.runs(last, self._segments)
         batch = memory.segment_batch(np.concatenate(windows))  # (S, n): S segments of all windows
         row, place = places([len(window) for window in windows])
-        inside = side_by_side(torch.from_numpy(segment_steps(batch)), row, place)  # (B, L)
+        inside = side_by_side(self._put(segment_steps(batch)), row, place)  # (B, L)
         before = self._standardised(batch.observations[:, :-1])
         observations = side_by_side(before, row, place)  # (B, L, O)
-        actions = side_by_side(torch.tensor(batch.actions), row, place)  # (B, L, A)
+        actions = side_by_side(self._put(batch.actions), row, place)  # (B, L, A)
         rewards, predicted = self.network(observations, actions, inside)  # (B, L), (B, L, O)
         after = self._standardised(batch.observations[:, 1:])
         following = side_by_side(after, row, place)  # (B, L, O)

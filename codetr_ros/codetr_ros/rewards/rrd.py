@@ -65,7 +65,7 @@ class Rrd(Learned):
         steps = subsequences(rng, batch.lengths, rrd.subsequence_steps)  # (B, K)
         rewards = self._rewards_at(batch, steps)
         returns = self._scaled(batch.values / batch.lengths)
-        lengths = torch.from_numpy(batch.lengths)
+        lengths = self._put(batch.lengths)
         yield {
             'reward_loss': decomposition_loss(rewards, returns, lengths, rrd.loss == 'unbiased')
         }
@@ -79,7 +79,7 @@ class Rrd(Learned):
         row = np.arange(len(steps))[:, None]
         before = self._standardised(batch.observations[row, steps])  # (B, K, O)
         after = self._standardised(batch.observations[row, steps + 1])
-        actions = torch.tensor(batch.actions[row, steps])  # (B, K, A)
+        actions = self._put(batch.actions[row, steps])  # (B, K, A)
         inputs = torch.cat([before, actions, before - after], -1)  # (B, K, O + A + O)
         rewards: Tensor = self.network(inputs).squeeze(-1)
         return rewards

@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from typing import ClassVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -20,6 +19,8 @@ PART_BYTES = 16 << 20
 """Upper bound of one window's or several windows' activations of one kind, where more than one
 window is looked at: half of what the C library serves from memory that it has (`freed_memory`).
 """
+DEVICE_PART_BYTES = 1 << 30
+"""The same on another device than the CPU, which wants much to do at a time (not measured)."""
 
 
 class SequenceMethod(Learned):
@@ -69,10 +70,11 @@ class SequenceMethod(Learned):
 
         They stay in the processor's cache, and their memory is used again.
         """
+        most = PART_BYTES if self.device.type == 'cpu' else DEVICE_PART_BYTES
         windows, steps = batch.actions.shape[:2]
         tokens = steps * (2 if self._codetr.tokens == 'pair' else 1)
         widest = max(4 * self._codetr.embedding, self._codetr.heads * tokens) * tokens * 4
-        count = -(-windows // max(1, PART_BYTES // widest))
+        count = -(-windows // max(1, most // widest))
         size = -(-windows // count)
         return [batch.part(slice(i, i + size)) for i in range(0, windows, size)]
 
@@ -89,7 +91,7 @@ class SequenceMethod(Learned):
                 f'delay = {self._settings.delay} and codetr.window = {self._codetr.window}'
             )
         observations = self._standardised(batch.observations[:, :-1])
-        return observations, torch.tensor(batch.actions), torch.from_numpy(inside)
+        return observations, self._put(batch.actions), self._put(inside)
 
 
 def learning_rate(settings: CodetrSettings, step: int) -> float:

@@ -12,6 +12,7 @@ never sees the padding behind it, and the attention within the sequence is maske
 """
 
 import math
+from contextlib import nullcontext
 
 import torch
 from torch import Tensor, nn
@@ -61,14 +62,15 @@ def causal_attention(q: Tensor, k: Tensor, v: Tensor, dropout: float) -> Tensor:
     asking, tokens = q.shape[2], k.shape[2]
     if not dropout and asking == tokens:
         return F.scaled_dot_product_attention(q, k, v, is_causal=True)
-    last = torch.arange(1, asking + 1)[:, None] * (tokens // asking) - 1  # (Q, 1)
-    unseen = torch.zeros(asking, tokens).masked_fill_(torch.arange(tokens) > last, -math.inf)
+    token = torch.arange(tokens, device=q.device)
+    last = (token[:asking, None] + 1) * (tokens // asking) - 1  # (Q, 1)
+    unseen = torch.zeros(asking, tokens, device=q.device).masked_fill_(token > last, -math.inf)
     if not dropout:
         return F.scaled_dot_product_attention(q, k, v, attn_mask=unseen)
     scale = 1 / math.sqrt(q.shape[3])
     logits = torch.baddbmm(unseen, q.flatten(0, 1), k.flatten(0, 1).mT, alpha=scale)
     attention = logits.softmax(-1)  # (B H, Q, N)
-    attention = attention * keep_mask(attention.shape, dropout)
+    attention = attention * keep_mask(attention.shape, dropout, attention.device)
     return (attention @ v.flatten(0, 1)).view(q.shape)
 
 
@@ -129,9 +131,10 @@ class CausalTransformer(nn.Module):
             tokens = s + a + position  # (B, L, d)
         h = self.norm_in(tokens)  # (B, N, d)
         if self.training and self.dropout:
-            h = h * keep_mask(h.shape, self.dropout)
+            h = h * keep_mask(h.shape, self.dropout, h.device)
         *others, last = self.blocks
-        with torch.autocast(h.device.type, torch.bfloat16, enabled=self.rounded):
+        rounded = torch.autocast(h.device.type, torch.bfloat16) if self.rounded else nullcontext()
+        with rounded:
             for block in others:
                 h = block(h)
             h = last(h, 2 if self.pair else 1)
@@ -152,7 +155,7 @@ class SequenceWeights(nn.Module):
     def attention(self, x: Tensor, inside: Tensor) -> Tensor:
         """Softmax attention (B, L, L) among the steps `inside` (B, L); rows of others are 0."""
         q, k = self.qk(x).chunk(2, -1)  # each (B, L, d)
-        unseen = torch.zeros(inside.shape).masked_fill_(~inside, -math.inf)  # (B, L)
+        unseen = torch.zeros(inside.shape, device=x.device).masked_fill_(~inside, -math.inf)
         logits = self.scale * (q @ k.transpose(1, 2)) + unseen[:, None, :]  # (B, L, L)
         found: Tensor = logits.softmax(-1) * inside[:, :, None]  # (B, L, L)
         return found
