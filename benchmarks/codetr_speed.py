@@ -2,6 +2,7 @@
 
     .venv/bin/python benchmarks/codetr_speed.py                       # on an idle machine
     .venv/bin/python benchmarks/codetr_speed.py --delays 25 100 --threads 1 --rounds 3
+    .venv/bin/python benchmarks/codetr_speed.py --device cuda --threads 1 --out codetr_speed_cuda
 
 Measured, at the size that the preset `paper` gives the reward transformer, on steps of Ant (27
 observations, 8 actions), for each delay n:
@@ -15,6 +16,10 @@ steps by the MLP's weights. A ratio of 1 is as fast as the products alone. `as w
 same ratio with the operations of a network that is written plainly, with the tokens that nobody
 reads and the products that are then masked, which are left out here. Rounds go through everything
 in turn; the table gives the median round, and the lowest and highest in brackets.
+
+On a GPU (`--device cuda`) a third shape, 4096x4096 by 4096x4096, says what matrices reach there,
+and all of the memory is labelled, 4096 segments at a time. Batches are made on the CPU in any
+case.
 
 `--clock cpu` counts the time that the processor worked instead of the time on the wall: for one
 thread on a machine that does other things as well.
@@ -40,11 +45,13 @@ from codetr_ros.rewards.cost import Cost
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.trajectories import Trajectories
 
-RESULTS = Path(__file__).parent / 'results' / 'codetr_speed'
+RESULTS = Path(__file__).parent / 'results'
 OBSERVATION, ACTION = 27, 8  # Ant
 DELAYS = (5, 25, 50, 100, 200, 500)
 EPISODE, EPISODES = 1000, 64
 LABELLED = 6400  # steps, or 64 segments where these are more
+SHAPES = (256, 256, 256), (64 * 50, 256, 1024)
+LARGE = 4096, 4096, 4096  # for a GPU
 
 
 def memory(delay: int) -> Trajectories:
@@ -71,7 +78,8 @@ class Work:
         self.model = Codetr(settings, OBSERVATION, ACTION)
         self.model.prepare(self.memory)
         segments = max(LABELLED // settings.delay, 64)
-        self.ids = self.memory.segment_ids()[:segments]
+        ids = self.memory.segment_ids()
+        self.ids = ids[:segments] if settings.reward_device == 'cpu' else ids
         self.steps = 0
 
     def gradient(self) -> tuple[int, int]:
@@ -97,45 +105,62 @@ class Work:
         return Cost(*size), Cost(*size, plain=True)
 
 
-def sgemm() -> float:
+def sgemm(device: torch.device) -> float:
     """Operations per second of products of float32 matrices."""
     best = 0.0
-    for rows, inner, columns in ((256, 256, 256), (64 * 50, 256, 1024)):
-        a, b = torch.randn(rows, inner), torch.randn(inner, columns)
-        out = torch.empty(rows, columns)
+    on_gpu = device.type != 'cpu'
+    for rows, inner, columns in (*SHAPES, LARGE) if on_gpu else SHAPES:
+        a = torch.randn(rows, inner, device=device)
+        b = torch.randn(inner, columns, device=device)
+        out = torch.empty(rows, columns, device=device)
         flops = 2 * rows * inner * columns
-        times = max(1, round(5e9 / flops))
+        times = max(1, round((2e12 if on_gpu else 5e9) / flops))
         torch.mm(a, b, out=out)
+        wait(device)
         began = CLOCKS[clock]()
         for _ in range(times):
             torch.mm(a, b, out=out)
+        wait(device)
         best = max(best, times * flops / (CLOCKS[clock]() - began))
     return best
+
+
+def wait(device: torch.device) -> None:
+    """Until the device has done what it was asked for."""
+    if device.type != 'cpu':
+        torch.accelerator.synchronize(device)
 
 
 CLOCKS: dict[str, Callable[[], float]] = {'wall': time.perf_counter, 'cpu': time.process_time}
 clock = 'wall'
 
 
-def measure(delay: int, threads: int, precision: str, rounds: int) -> list[dict[str, Any]]:
+def measure(
+    delay: int, threads: int, precision: str, rounds: int, device: str
+) -> list[dict[str, Any]]:
     """All rounds of one delay, number of threads and precision."""
     torch.set_num_threads(threads)
-    changes = {'delay': delay, 'threads': threads, 'codetr.precision': precision}
+    changes: dict[str, Any] = {'delay': delay, 'threads': threads, 'codetr.precision': precision}
+    if device != 'cpu':
+        changes |= {'reward_device': device, 'codetr.label_batch': 4096}
     work = Work(load('paper').changed(changes))
+    where = work.model.device
     tasks: dict[str, tuple[Callable[[], tuple[int, int]], int]] = {
         'gradient': (work.gradient, 1),
         'label': (work.label, len(work.ids) * delay),
     }
     for task, _ in tasks.values():
         task()  # does not count
+        wait(where)
     rows = []
     for n in range(rounds):
         for name, (task, units) in tasks.items():
-            before = sgemm()
+            before = sgemm(where)
             began = CLOCKS[clock]()
             flops, plain = task()
+            wait(where)
             seconds = CLOCKS[clock]() - began
-            floor = (before + sgemm()) / 2  # a virtual machine's speed changes within seconds
+            floor = (before + sgemm(where)) / 2  # a virtual machine's speed changes within seconds
             rows.append(
                 {'delay': delay, 'threads': threads, 'precision': precision}
                 | {'what': name, 'round': n}
@@ -170,7 +195,6 @@ def line(rows: list[dict[str, Any]]) -> str:
 
 def write(rows: list[dict[str, Any]], out: Path, facts: dict[str, str]) -> None:
     """The CSV file of all rounds, and the table."""
-    out.parent.mkdir(parents=True, exist_ok=True)
     with out.with_suffix('.csv').open('w', newline='') as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
@@ -196,7 +220,8 @@ def main() -> None:
     parser.add_argument('--precisions', nargs='+', default=['float32', 'bfloat16'])
     parser.add_argument('--rounds', type=int, default=7)
     parser.add_argument('--clock', choices=list(CLOCKS), default='wall')
-    parser.add_argument('--out', type=Path, default=RESULTS, help='without its suffix')
+    parser.add_argument('--device', default='cpu', help='cpu, cuda, cuda:1, ...')
+    parser.add_argument('--out', default='codetr_speed', help='name of the results')
     arguments = parser.parse_args()
     clock = arguments.clock
     load_before = machine.load()
@@ -205,10 +230,12 @@ def main() -> None:
     for threads in arguments.threads:
         for delay in arguments.delays:
             for precision in arguments.precisions:
-                rows += measure(delay, threads, precision, arguments.rounds)
+                rows += measure(delay, threads, precision, arguments.rounds, arguments.device)
     facts = machine.facts(load_before, ('torch', 'numpy'))
+    if arguments.device != 'cpu':
+        facts['device'] = torch.cuda.get_device_name(arguments.device)
     facts |= {'clock': clock, 'rounds': str(arguments.rounds), 'command': ' '.join(sys.argv)}
-    write(rows, arguments.out, facts)
+    write(rows, RESULTS / arguments.out, facts)
 
 
 if __name__ == '__main__':
