@@ -385,6 +385,13 @@ class Settings(Group):
         description='steps of the memory that are labelled again in a phase, whole segments with '
         'the oldest labels first, one at least; what is new is always labelled; 0: all',
     )
+    relabel: Literal['all', 'drawn'] = Field(
+        'all',
+        description='steps of the memory that are labelled again in a phase: all, or those that '
+        'the updates after it will draw, which is known beforehand: SAC sees the newest labels '
+        'either way. Worth its while with `codetr.labelling` window in a large memory; else whole '
+        'segments are labelled that hold such a step',
+    )
     record_relabels: Literal['first', 'all'] = Field(
         'first',
         description='labels in the bag: the first of each segment and, at evaluations, all that '
@@ -435,6 +442,29 @@ class Settings(Group):
             raise ValueError(
                 f'device={self.device} with method={self.method}: its policy learner runs on the '
                 'CPU only; set device=cpu'
+            )
+        return self
+
+    @model_validator(mode='after')
+    def _what_is_drawn_is_known(self) -> 'Settings':
+        if self.relabel == 'all':
+            return self
+        if not self.labels_steps:
+            raise ValueError(
+                f'relabel={self.relabel} with method={self.method}: its policy learner draws no '
+                'labelled steps; set relabel=all'
+            )
+        if self.device != 'cpu':
+            raise ValueError(
+                f'relabel={self.relabel} with device={self.device}: SAC draws there from a '
+                "generator of the device's own, and nobody else knows what; set device=cpu or "
+                'relabel=all'
+            )
+        if self.relabel_steps:
+            raise ValueError(
+                f'relabel={self.relabel} with relabel_steps={self.relabel_steps}: one labels '
+                'again all that will be drawn, the other so many of the oldest; set '
+                'relabel_steps=0 or relabel=all'
             )
         return self
 

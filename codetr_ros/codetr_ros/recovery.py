@@ -35,7 +35,10 @@ class _Source:
         self._labels[slots] = np.nan
 
     def label(self, record: StepRewards) -> None:
-        """Labels of segments; those of steps that are no longer held are left out."""
+        """Labels of segments; those of steps that are no longer held are left out.
+
+        Steps are labelled with their whole segment the first time, and maybe some of them later.
+        """
         lengths = record.lengths.astype(np.int64)
         firsts = self._rows[record.episodes] + record.first_steps
         segments = np.repeat(firsts, lengths)
@@ -43,8 +46,9 @@ class _Source:
         rows = segments + within
         held = rows >= self._end - self._capacity
         slots = rows[held] % self._capacity
+        first = np.isnan(self._labels[slots])
+        self._segments[slots[first]] = segments[held][first]
         self._labels[slots] = record.labels[held]
-        self._segments[slots] = segments[held]
 
     def labelled(self) -> tuple[F32, F32, I64]:
         """Labels, true rewards and segments (T,) of the steps that have a label."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from codetr_ros.records import F32, F64, Transitions
+from codetr_ros.records import F32, F64, I64, Transitions
 
 COLUMNS = ('rows', 'lengths', 'offsets', 'episodes', 'values')
 """What is known of each scored segment."""
@@ -89,6 +89,12 @@ class SourceRing:
         """The number of the scored segment whose first step lies in a row that is held."""
         number = int(self._beginning[row % self.capacity])
         return number - 1 if number else None
+
+    def segments_over(self, rows: I64) -> I64:
+        """Where in the table the scored segments stand that rows (B,) lie in; each lies in one."""
+        table = np.flatnonzero(self.alive[: self.segments])
+        table = table[np.argsort(self.segment_rows[table], kind='stable')]
+        return table[np.searchsorted(self.segment_rows[table], rows, side='right') - 1]
 
     def append(self, chunk: Transitions, episode: Episode) -> None:
         """Add steps that follow on those of the episode."""

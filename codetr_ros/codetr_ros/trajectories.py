@@ -341,6 +341,19 @@ class Trajectories:
             for s in self._sources.values()
         }
 
+    def draw(self, rng: np.random.Generator, batch: int) -> I64:
+        """Places (B,) among the labelled steps, drawn uniformly, with replacement.
+
+        What is drawn one after the other is the same in batches of any size.
+
+        Raises:
+            ValueError: no step is labelled.
+        """
+        count = self.labelled_steps
+        if not count:
+            raise ValueError('no step of the memory is labelled: nothing to sample')
+        return rng.integers(0, count, batch)
+
     def sample_steps(self, rng: np.random.Generator, batch: int) -> StepBatch:
         """Draw labelled steps uniformly, with replacement.
 
@@ -348,9 +361,7 @@ class Trajectories:
             ValueError: no step is labelled.
         """
         slots, sources = self._labelled()
-        if not len(slots):
-            raise ValueError('no step of the memory is labelled: nothing to sample')
-        drawn = slots[rng.integers(0, len(slots), batch)].astype(np.int64)
+        drawn = slots[self.draw(rng, batch)].astype(np.int64)
         if len(sources) == 1:
             return self.steps_in(sources[0], drawn)
         width = self.capacity + self._margin
@@ -381,6 +392,41 @@ class Trajectories:
             small = len(sources) * width <= 2**32
             self._sampleable = (slots.astype(np.uint32) if small else slots, sources)
         return self._sampleable
+
+    def label_versions(self) -> I64:
+        """The version of the model that gave each labelled step its label."""
+        held = ((s, slice(min(s.end, s.capacity))) for s in self._labelled()[1])
+        parts = [s.versions[rows][np.isfinite(s.labels[rows])] for s, rows in held]
+        return np.concatenate([np.empty(0, np.int64), *parts])
+
+    def versions(self, ids: I64) -> I64:
+        """The version of the model that labelled the first step of segments by id; -1: none."""
+        found = np.empty(len(ids), np.int64)
+        for _, source, mine, at in self._by_source(ids):
+            slots = source.segment_rows[at] % source.capacity
+            found[mine] = source.versions[slots]
+            found[mine[np.isnan(source.labels[slots])]] = -1
+        return found
+
+    def located(self, places: I64) -> tuple[I64, I64]:
+        """Where labelled steps lie, given by their places among them.
+
+        Returns:
+            The id of each one's segment (B,), and its number within the segment (B,), ordered by
+            the one and then by the other.
+        """
+        slots, sources = self._labelled()
+        chosen = slots[places].astype(np.int64)
+        width = self.capacity + self._margin
+        ids, within = np.empty_like(chosen), np.empty_like(chosen)
+        for index, source in enumerate(sources):
+            mine = np.flatnonzero(chosen // width == index)
+            rows = source.start + (chosen[mine] % width - source.start) % source.capacity
+            at = source.segments_over(rows)
+            ids[mine] = (at + source.first_segment) | (index << _SOURCE_SHIFT)
+            within[mine] = rows - source.segment_rows[at]
+        order = np.lexsort((within, ids))
+        return ids[order], within[order]
 
     @staticmethod
     def steps_in(source: SourceRing, slots: NDArray[np.int64]) -> StepBatch:
@@ -467,26 +513,22 @@ class Trajectories:
 
         `context` counts the steps of a window that precede the segment of its last step.
         """
-        rows, owners, contexts, lengths = [], [], [], []
-        for segment, (row, length, offset) in zip(
-            ids.tolist(), self._spans(ids).tolist(), strict=True
-        ):
-            steps = np.arange(length)
-            size = np.minimum(window, offset + steps + 1)
-            rows.append(row + steps + 1 - size)
-            lengths.append(size)
-            contexts.append(np.maximum(0, size - steps - 1))
-            owners.append(np.full(length, segment))
-        if not rows:
-            return
-        all_rows, all_owners = np.concatenate(rows), np.concatenate(owners)
-        all_contexts, all_lengths = np.concatenate(contexts), np.concatenate(lengths)
-        for i in range(0, len(all_rows), batch):
+        lengths = self.lengths(ids)
+        steps = _ranges(np.zeros_like(lengths), lengths)
+        return self.step_windows(np.repeat(ids, lengths), steps, window, batch)
+
+    def step_windows(
+        self, ids: I64, within: I64, window: int, batch: int
+    ) -> Iterator[SegmentBatch]:
+        """The same for single steps: each has its segment's id and its number within it."""
+        spans = self._spans(ids)
+        lengths = np.minimum(window, spans[:, 2] + within + 1)
+        rows = spans[:, 0] + within + 1 - lengths
+        context = np.maximum(0, lengths - within - 1)
+        for i in range(0, len(ids), batch):
             part = slice(i, i + batch)
-            nothing = np.full(len(all_rows[part]), np.nan)
-            yield self._windows(
-                all_owners[part], all_rows[part], all_lengths[part], all_contexts[part], nothing
-            )
+            nothing = np.full(len(ids[part]), np.nan)
+            yield self._windows(ids[part], rows[part], lengths[part], context[part], nothing)
 
     def segments(self, ids: I64) -> list[tuple[str, I64, I64, I64]]:
         """Where segments lie: for each source its name, and the episodes, first steps and lengths
@@ -501,6 +543,25 @@ class Trajectories:
             )
             for _, source, _, at in self._by_source(ids)
         ]
+
+    def pieces(self, ids: I64, within: I64) -> list[tuple[str, I64, I64, I64]]:
+        """Where single steps lie, as `segments` says it: one run for those of a segment that
+        follow on each other.
+
+        Args:
+            ids: each step's segment, by source.
+            within: its number within the segment.
+        """
+        follows = (np.diff(ids, prepend=-1) == 0) & (np.diff(within, prepend=-1) == 1)
+        begins = np.flatnonzero(~follows)
+        lengths = np.diff(begins, append=len(ids))
+        found = []
+        at = 0
+        for source, episodes, firsts, _ in self.segments(ids[begins]):
+            mine = slice(at, at + len(episodes))
+            found.append((source, episodes, firsts + within[begins[mine]], lengths[mine]))
+            at += len(episodes)
+        return found
 
     def newest(self, counts: Sequence[int]) -> Rollout:
         """The last steps of each source, in order of names: as many as `counts` says, or as are

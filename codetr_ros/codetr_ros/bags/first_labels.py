@@ -16,7 +16,8 @@ class FirstLabels:
     """What of the step rewards goes into the bag.
 
     Every part is kept, so that the bag has as many as were published; a part holds the segments
-    labelled for the first time, or all of them where the phase's policy is evaluated.
+    labelled for the first time, or all that it had where the phase's policy is evaluated. Segments
+    are whole the first time; later rows may be some of their steps (`relabel` 'drawn').
 
     Memory: 16 bytes for each segment that the reward side may hold, for each source. It evicts
     whole episodes, oldest first, and labels nothing of them again: an episode is forgotten here
@@ -46,12 +47,12 @@ class FirstLabels:
     def _note(
         self, source: str, episodes: U32, first_steps: U32, lengths: U32
     ) -> NDArray[np.bool_]:
-        """Which segments are new; they are not from now on."""
+        """Which segments are new; they, and whatever lies in them, are not from now on."""
         given = episodes.astype(np.uint64) << _EPISODE_BITS | first_steps
         keys, steps = self._seen.get(source, _NONE)
-        fresh: NDArray[np.bool_] = np.searchsorted(keys, given) == np.searchsorted(
-            keys, given, 'right'
-        )
+        ends = np.concatenate([np.zeros(1, np.uint64), keys + steps.astype(np.uint64)])
+        # the end of the last segment that begins there or before: 0 where there is none
+        fresh: NDArray[np.bool_] = given >= ends[np.searchsorted(keys, given, 'right')]
         if fresh.any():
             keys = np.concatenate([keys, given[fresh]])
             steps = np.concatenate([steps, lengths[fresh].astype(np.int64)])

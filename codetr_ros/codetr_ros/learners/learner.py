@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from codetr_ros import drawing
 from codetr_ros.config import Settings
 from codetr_ros.learners import network
-from codetr_ros.seeding import generator, seed_torch
+from codetr_ros.seeding import seed_torch
 from codetr_ros.trajectories import Trajectories
 
 
@@ -105,21 +106,16 @@ class OffPolicy(ABC):
             LearnerError: the policy is not finite any more.
         """
         settings = self._settings
-        due = round(settings.steps_of(phase) * settings.sac.updates_per_step)
+        due = drawing.updates_of(settings, phase)
         if not self._prepare(memory):
             self.counters[f'updates skipped, {self.lacking}'] += due
             return
         totals: dict[str, Tensor] = {}
         began = time.perf_counter()
-        done = 0
-        while done < due:
-            # a slice of its own stream: neither interleaving nor a restart changes what it draws
-            rng = generator(settings.seed, 'learner', phase, done)
-            seed_torch(settings.seed, 'learner', phase, done)
-            burst = min(settings.sac.burst, due - done)
-            add(totals, self._burst(memory, rng, burst))
-            done += burst
-            self.updates += burst
+        for burst in drawing.bursts(settings, phase):
+            seed_torch(settings.seed, 'learner', phase, burst.first)
+            add(totals, self._burst(memory, burst.rng, burst.updates))
+            self.updates += burst.updates
             yield {}
         means = {name: float(total) / due for name, total in totals.items()}
         if not all(bool(weight.isfinite().all()) for weight in self.actor.parameters()):

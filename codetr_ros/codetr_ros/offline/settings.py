@@ -10,7 +10,7 @@ OF_NO_EFFECT = frozenset(
     [
         *('task', 'composite', 'beta', 'steps', 'phase_steps', 'warmup_steps', 'overlap'),
         *('simulators', 'envs', 'evaluate_every', 'evaluate_episodes', 'r_max', 'device'),
-        *('record_relabels', 'relabel_steps', 'sac', 'hc', 'lirpg'),
+        *('record_relabels', 'relabel', 'relabel_steps', 'sac', 'hc', 'lirpg'),
     ]
 )
 """Settings about simulating and about learning a policy: facts of the data, or of no interest."""

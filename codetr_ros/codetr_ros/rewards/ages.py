@@ -1,62 +1,54 @@
-"""Which segments are labelled, by which version of the model, and which are due next."""
+"""Which labels of the memory are due, and how old those are that it holds.
 
-from collections.abc import Callable
+Ages are in versions of the model since then: in gradient steps, for a method that takes such.
+"""
 
 import numpy as np
 
+from codetr_ros import drawing
+from codetr_ros.config import Settings
 from codetr_ros.records import I64
+from codetr_ros.trajectories import Trajectories
 
-_NEVER = -1
 
+def segments_due(memory: Trajectories, version: int, settings: Settings) -> I64:
+    """Segments to be labelled whole by a version of the model, in the order of their ids.
 
-class LabelAges:
-    """The version of the model that labelled each segment.
-
-    Ages are in versions since then: in gradient steps, for a method that takes such.
+    All that have no label, and with `relabel` 'all' of those with a label of another version all
+    (`relabel_steps` 0), or whole segments of at most so many steps, those with the oldest labels
+    first, among equals those with the lowest id; one at least.
     """
+    ids = memory.segment_ids()
+    versions = memory.versions(ids)
+    new = versions < 0
+    if settings.relabel == 'drawn':
+        return ids[new]
+    stale = ~new & (versions != version)
+    if settings.relabel_steps:
+        places = np.flatnonzero(stale)
+        places = places[np.argsort(versions[places], kind='stable')]
+        steps = np.cumsum(memory.lengths(ids[places]))
+        enough = np.searchsorted(steps, settings.relabel_steps, side='right')
+        stale[places[max(1, int(enough)) :]] = False
+    due: I64 = ids[new | stale]
+    return due
 
-    def __init__(self) -> None:
-        self._ids = np.empty(0, np.int64)
-        self._versions = np.empty(0, np.int64)
 
-    def follow(self, ids: I64) -> None:
-        """Take note of what segments the memory holds now; others are forgotten."""
-        versions = np.full(len(ids), _NEVER, np.int64)
-        _, here, before = np.intersect1d(ids, self._ids, assume_unique=True, return_indices=True)
-        versions[here] = self._versions[before]
-        self._ids, self._versions = ids, versions
+def steps_due(
+    memory: Trajectories, version: int, settings: Settings, phase: int
+) -> tuple[I64, I64]:
+    """Steps with a label of another version that the updates of a phase will draw.
 
-    def due(self, version: int, lengths: Callable[[I64], I64], most: int) -> I64:
-        """Segments to be labelled by a version of the model, in the order of their ids.
+    Returns:
+        The id of each one's segment, and its number within the segment, ordered by both.
+    """
+    drawn = drawing.drawn(settings, phase, memory)
+    return memory.located(drawn[memory.label_versions()[drawn] != version])
 
-        All that have no label, and of those with a label of another version all (`most` 0), or
-        whole segments of at most so many steps, those with the oldest labels first, among equals
-        those with the lowest id; one at least.
 
-        Args:
-            version: of the model.
-            lengths: gives the steps of segments by id.
-            most: steps of segments that are labelled again.
-        """
-        stale = (self._versions != version) & (self._versions != _NEVER)
-        if most:
-            places = np.flatnonzero(stale)
-            places = places[np.argsort(self._versions[places], kind='stable')]
-            enough = np.searchsorted(np.cumsum(lengths(self._ids[places])), most, side='right')
-            stale[places[max(1, int(enough)) :]] = False
-        found: I64 = self._ids[stale | (self._versions == _NEVER)]
-        return found
-
-    def label(self, ids: I64, version: int) -> None:
-        """Take note that segments have been labelled."""
-        self._versions[np.searchsorted(self._ids, ids)] = version
-
-    def metrics(self, version: int, lengths: Callable[[I64], I64]) -> dict[str, float]:
-        """How old labels are: the mean over all labelled steps, and the oldest."""
-        labelled = self._versions != _NEVER
-        if not labelled.any():
-            return {}
-        ages = version - self._versions[labelled]
-        steps = lengths(self._ids[labelled])
-        mean = float((ages * steps).sum() / steps.sum())
-        return {'label_age_mean': mean, 'label_age_max': float(ages.max())}
+def metrics(memory: Trajectories, version: int) -> dict[str, float]:
+    """How old labels are: the mean over all labelled steps, and the oldest."""
+    ages = version - memory.label_versions()
+    if not len(ages):
+        return {}
+    return {'label_age_mean': float(ages.sum() / len(ages)), 'label_age_max': float(ages.max())}

@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,7 @@ from codetr_ros.records import (
     Transitions,
     TrueRewards,
 )
-from codetr_ros.rewards import saved
-from codetr_ros.rewards.ages import LabelAges
+from codetr_ros.rewards import ages, saved
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.trajectories import Trajectories
 
@@ -74,7 +73,6 @@ class Labeller(Consumer):
         super().__init__(run, settings, name, folder, scores=True, true_rewards=oracle)
         self._method: rewards.RewardMethod | None = None
         self._fitted = False
-        self._ages = LabelAges()
 
     @property
     def method(self) -> rewards.RewardMethod | None:
@@ -112,7 +110,7 @@ class Labeller(Consumer):
         for batch in self._label(phase, memory, method):
             parts += batch
             yield []
-        metrics |= self._ages.metrics(method.version, memory.lengths)
+        metrics |= ages.metrics(memory, method.version)
         metrics |= {
             'steps_labelled': sum(len(part.labels) for part in parts),
             'target_scale': method.target_scale,
@@ -147,34 +145,43 @@ class Labeller(Consumer):
     def _label(
         self, phase: int, memory: Trajectories, method: rewards.RewardMethod
     ) -> Iterator[list[StepRewards]]:
-        """Label what is new, and of what has changed as much as `relabel_steps` says.
+        """Label what is new, and of what has changed as much as the settings ask for.
 
-        A slice is `label_batch` segments.
+        The memory takes the labels in as that of the learner will: it then tells what is labelled,
+        by which version, and what the learner will draw.
         """
-        self._ages.follow(memory.segment_ids())
-        todo = self._ages.due(method.version, memory.lengths, self._settings.relabel_steps)
-        for i in range(0, len(todo), method.label_batch):
-            some = todo[i : i + method.label_batch]
-            passes = []
-            for labels in method.label_passes(memory, some):
-                passes.append(labels)
-                yield []
-            joined = np.concatenate(passes)
-            if not np.isfinite(joined).all():
-                raise rewards.RewardModelError(
-                    f'labels of method {method.name!r} are not finite after '
-                    f'{method.gradient_steps} gradient steps: training has diverged. '
-                    'Lower its learning_rate, or set target_scale=rms'
-                )
-            self._ages.label(some, method.version)
-            yield self._records(phase, memory, some, joined, method.version)
+        due = ages.segments_due(memory, method.version, self._settings)
+        yield from self._whole(phase, memory, method, due)
+        if self._settings.relabel == 'all':
+            return
+        ids, within = ages.steps_due(memory, method.version, self._settings, phase)
+        if not method.single_steps:
+            yield from self._whole(phase, memory, method, np.unique(ids))
+        elif len(ids):
+            labels = yield from _joined(method, method.step_passes(memory, ids, within))
+            yield self._applied(phase, memory, memory.pieces(ids, within), labels, method.version)
 
-    def _records(
-        self, phase: int, memory: Trajectories, ids: I64, labels: F32, version: int
+    def _whole(
+        self, phase: int, memory: Trajectories, method: rewards.RewardMethod, ids: I64
+    ) -> Iterator[list[StepRewards]]:
+        """Label segments, `label_batch` of them at a time."""
+        for i in range(0, len(ids), method.label_batch):
+            some = ids[i : i + method.label_batch]
+            labels = yield from _joined(method, method.label_passes(memory, some))
+            yield self._applied(phase, memory, memory.segments(some), labels, method.version)
+
+    def _applied(
+        self,
+        phase: int,
+        memory: Trajectories,
+        spans: list[tuple[str, I64, I64, I64]],
+        labels: F32,
+        version: int,
     ) -> list[StepRewards]:
+        """Labels of spans of steps, as `Trajectories.segments` says where these lie."""
         found = []
         at = 0
-        for source, *where in memory.segments(ids):  # ids are ordered by source
+        for source, *where in spans:
             lengths = where[2]
             begin = 0
             while begin < len(lengths):
@@ -199,6 +206,8 @@ class Labeller(Consumer):
                 )
                 at += steps
                 begin = end
+        for record in found:
+            memory.apply(record)
         return found
 
     def _numbered(self, phase: int, version: int, found: list[StepRewards]) -> list[StepRewards]:
@@ -254,3 +263,25 @@ class Labeller(Consumer):
                 'frozen': self._frozen,
             }
         return said
+
+
+def _joined(
+    method: rewards.RewardMethod, passes: Iterator[F32]
+) -> Generator[list[StepRewards], None, F32]:
+    """Labels from all forward passes, a slice each.
+
+    Raises:
+        RewardModelError: one is not finite.
+    """
+    found = []
+    for labels in passes:
+        found.append(labels)
+        yield []
+    joined: F32 = np.concatenate(found)
+    if not np.isfinite(joined).all():
+        raise rewards.RewardModelError(
+            f'labels of method {method.name!r} are not finite after '
+            f'{method.gradient_steps} gradient steps: training has diverged. '
+            'Lower its learning_rate, or set target_scale=rms'
+        )
+    return joined

@@ -33,7 +33,8 @@ class RewardMethod(ABC):
 
     In each phase that is learnt from it calls `prepare`, then `gradient_step` as often as
     `schedule` says, then `label_passes`: where `version` has risen of all segments, or of those
-    with the oldest labels (`relabel_steps`), and of the new ones in any case.
+    with the oldest labels (`relabel_steps`), or of those that will be drawn (`relabel`), and of
+    the new ones in any case.
 
     Labels are in the unit that `settings.reward_unit` asks for: in units of the target scale c
     (`scaled`), or as the task gives them (`raw`).
@@ -107,6 +108,23 @@ class RewardMethod(ABC):
         """Labels of the segments' steps one after the other, forward pass by forward pass."""
         batch = memory.segment_batch(ids, self.context)
         yield self.label(batch)[segment_steps(batch)]
+
+    @property
+    def single_steps(self) -> bool:
+        """Whether some steps of a segment are labelled at less cost than all: by `step_passes`."""
+        return False
+
+    def step_passes(
+        self, memory: Trajectories, ids: NDArray[np.int64], within: NDArray[np.int64]
+    ) -> Iterator[F32]:
+        """Labels of single steps, where `single_steps` says so, forward pass by forward pass.
+
+        Args:
+            memory: holds them.
+            ids: each step's segment.
+            within: its number within the segment.
+        """
+        raise NotImplementedError(f'method {self.name!r} labels whole segments')
 
     def state(self) -> dict[str, torch.Tensor]:
         """Everything that it takes to go on from here, in copies."""

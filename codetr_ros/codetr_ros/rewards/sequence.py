@@ -60,6 +60,18 @@ class SequenceMethod(Learned):
             for batch in memory.windows(ids, self._codetr.window, self.label_batch):
                 yield self.label_windows(batch)
 
+    @property
+    def single_steps(self) -> bool:
+        """Whether each step has a window of its own (`labelling`)."""
+        return self._codetr.labelling == 'window'
+
+    def step_passes(
+        self, memory: Trajectories, ids: NDArray[np.int64], within: NDArray[np.int64]
+    ) -> Iterator[F32]:
+        """Labels of single steps, from windows."""
+        for batch in memory.step_windows(ids, within, self._codetr.window, self.label_batch):
+            yield self.label_windows(batch)
+
     def label_windows(self, batch: SegmentBatch) -> F32:
         """Step rewards (B,) of the last step of each window."""
         labels = self.label(batch)
