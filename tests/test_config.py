@@ -83,6 +83,26 @@ def test_an_unknown_setting_is_refused_and_the_known_ones_are_named(name: str) -
     assert 'codetr.layers' in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    ('others', 'said'),
+    [
+        ({'method': 'hc'}, 'relabel=drawn with method=hc: its policy learner draws no labelled'),
+        ({'method': 'lirpg'}, 'relabel=drawn with method=lirpg: its policy learner draws no'),
+        ({'device': 'cuda'}, 'relabel=drawn with device=cuda: SAC draws there from a generator'),
+        ({'relabel_steps': 7}, 'relabel=drawn with relabel_steps=7: one labels again all that'),
+    ],
+)
+def test_drawn_steps_are_not_to_be_labelled_where_they_are_unknown_or_others_are_asked_for(
+    others: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(SettingsError) as refused:
+        config.load('quick').changed({'relabel': 'drawn', **others}, 'here')
+
+    assert said in str(refused.value)
+    assert str(refused.value).endswith('relabel=all')
+    assert config.load('quick').changed({'relabel': 'drawn'}).relabel == 'drawn'
+
+
 def test_every_fault_of_a_file_is_named_at_once(tmp_path: Path) -> None:
     file = tmp_path / 'mine.yaml'
     file.write_text('delay: 0\nstepz: 3\ncodetr: {layers: many}\n')

@@ -57,6 +57,22 @@ def test_the_newest_labels_are_compared_with_the_true_rewards_of_their_steps():
     assert row['within'] == pytest.approx(stats.pearsonr(*within).statistic)
 
 
+def test_labels_given_again_to_some_steps_of_a_segment_leave_it_one_segment():
+    true, said = [1.0, 2.0, 4.0, 3.0], [0.0, 2.0, 1.0, -1.0]
+    whole, runs = (
+        observe(true_rewards(0, 0, *true), labels(0, *first), *again)[-1]
+        for first, again in (
+            ([(0, 0, said[:2]), (0, 2, said[2:])], []),
+            (
+                [(0, 0, [9.0, 8.0]), (0, 2, [7.0, said[3]])],
+                [labels(1, (0, 1, said[1:2]), (0, 2, said[2:3]), (0, 0, said[:1]))],
+            ),
+        )
+    )
+
+    assert {**runs, 'step': 0} == {**whole, 'step': 0}
+
+
 def test_segments_of_two_sources_are_not_taken_for_one():
     settings = SETTINGS.changed({'simulators': 2})
     (row,) = observe(

@@ -175,6 +175,58 @@ def test_windows_end_with_each_step_and_say_what_precedes_its_segment():
     assert at == len(observations)
 
 
+@pytest.mark.parametrize('sources', [('sim',), ('a', 'b')])
+@pytest.mark.parametrize('capacity', [1000, 30])
+def test_steps_that_are_drawn_are_found_in_their_segments(sources, capacity):
+    m, _, truth = filled(3, sources, episodes=25, capacity=capacity)
+    places, firsts = np.unique(m.draw(np.random.default_rng(1), 20), return_index=True)
+    drawn = m.sample_steps(np.random.default_rng(1), 20).rewards[firsts]
+
+    ids, within = m.located(places)
+    spans = [
+        (source, episode, first + i, length)
+        for source, *columns in m.pieces(ids, within)
+        for episode, first, length in zip(*(c.tolist() for c in columns), strict=True)
+        for i in range(length)
+    ]
+
+    assert sorted(truth[span[:3]] for span in spans) == sorted(drawn.tolist())
+    assert any(length > 1 for *_, length in spans), 'some follow on each other'
+    beside = [(s, e, n + 1) for s, e, n, length in spans if length == 1]
+    crossing = [key for key in beside if key in {span[:3] for span in spans}]
+    assert all(number % DELAY == 0 for *_, number in crossing), 'a run is of one segment'
+
+
+def test_a_step_has_the_same_window_alone_as_with_its_segment():
+    m, _, _ = filled(7, episodes=5)
+    ids, window = m.segment_ids(), 6
+    whole = [
+        b.part(slice(i, i + 1)) for b in m.windows(ids, window, 7) for i in range(len(b.lengths))
+    ]
+    places = np.arange(1, m.labelled_steps, 3)
+    chosen = m.step_windows(*m.located(places), window, 5)
+    single = [b.part(slice(i, i + 1)) for b in chosen for i in range(len(b.lengths))]
+    for place, one in zip(places.tolist(), single, strict=True):
+        other, steps = whole[place], int(one.lengths[0])
+        assert (one.lengths, one.context) == (other.lengths, other.context)
+        np.testing.assert_array_equal(
+            one.observations[0, : steps + 1], other.observations[0, : steps + 1]
+        )
+        np.testing.assert_array_equal(one.actions[0, :steps], other.actions[0, :steps])
+
+
+def test_labels_tell_which_version_gave_them():
+    naive, m = Naive(0), memory()
+    m.append(naive.chunk('sim', 10))
+    for first in (4, 0):  # scored in another order
+        m.score(score('sim', 0, first, DELAY))
+    assert m.label_versions().tolist() == [] and m.versions(m.segment_ids()).tolist() == [-1, -1]
+    m.apply(labels('sim', [(0, 0, 4), (0, 4, 4)], np.ones(8), version=2))
+    m.apply(labels('sim', [(0, 3, 2)], np.ones(2), version=5))
+    assert m.label_versions().tolist() == [2, 2, 2, 5, 5, 2, 2, 2]
+    assert m.versions(m.segment_ids()).tolist() == [5, 2]
+
+
 def test_the_oldest_whole_episodes_leave_first_and_an_unfinished_one_stays():
     naive, m = Naive(0), memory(capacity=10)
     m.append(naive.chunk('sim', 6, 'truncated'))

@@ -104,3 +104,25 @@ def test_a_label_of_a_forgotten_episode_is_written_twice_rather_than_lost():
     first.keep(part(0, [(0, 0)]))
     first.keep(part(0, [(1, 0)], steps=MEMORY + 1))
     assert kept(first, part(1, [(0, 0)])) == [(0, 0)]
+
+
+def spans(phase, *rows):
+    """Labels of spans of steps: episode, first step, length."""
+    episodes, firsts, lengths = np.array(rows, np.uint32).T
+    labels = np.arange(lengths.sum(), dtype=np.float32)
+    return step_rewards(
+        phase=phase, episodes=episodes, first_steps=firsts, lengths=lengths, labels=labels
+    )
+
+
+def test_later_labels_of_some_steps_of_a_segment_are_no_first_ones():
+    first = FirstLabels(tiny(**NEVER))
+    first.keep(spans(0, (0, 0, 5), (0, 10, 5), (1, 0, 3)))
+    left = first.keep(
+        spans(1, (0, 5, 5), (1, 3, 5), (0, 1, 2), (0, 4, 1), (0, 10, 1), (0, 12, 3), (1, 2, 1))
+    )
+    assert list(zip(left.episodes.tolist(), left.first_steps.tolist(), strict=True)) == [
+        (0, 5), (1, 3),
+    ]  # fmt: skip
+    assert left.lengths.tolist() == [5, 5] and left.labels.tolist() == list(range(10))
+    assert len(first.keep(spans(2, (0, 9, 1), (1, 7, 1))).lengths) == 0
