@@ -148,7 +148,11 @@ class Commit:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class StepRewards:
-    """New and changed labels after a phase, in parts. From reward to learner and recorder."""
+    """New and changed labels after a phase, in parts. From reward to learner and recorder.
+
+    A row is a segment, whole the first time; later maybe some steps of it that follow on each
+    other (`relabel` 'drawn'), of which `first_steps` and `lengths` then speak.
+    """
 
     run_id: str
     phase: int

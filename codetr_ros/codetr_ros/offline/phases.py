@@ -36,7 +36,7 @@ NODE = 'reward'
 class Recorded:
     """The labels that the bag holds, compared with those made from it."""
 
-    same: int = 0  # segments
+    same: int = 0  # segments, or runs of steps of one
     other: int = 0
     _made: dict[tuple[int, str, int, int], bytes] = field(default_factory=dict)
 
