@@ -5,10 +5,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from builders import tiny
 from offline.bag_making import write
 
-from codetr_ros import checkpoints, cli
-from codetr_ros.records import Commit, CompositeReward, RunSpec, StepRewards, Transitions
+from codetr_ros import checkpoints, cli, in_process
+from codetr_ros.bags.verify import verify
+from codetr_ros.records import (
+    Commit,
+    CompositeReward,
+    Record,
+    RunSpec,
+    StepRewards,
+    Transitions,
+)
 
 DIGEST = 'reward_model_sha256'
 
@@ -27,6 +36,27 @@ def test_folding_the_bag_ends_with_the_weights_and_labels_of_the_run(a_run, tmp_
     assert said['recorded_labels'] == {'same': made, 'other': 0}
     assert said['phases'] == a_run.settings.phases
     assert said['changed_settings'] == {}
+
+
+def test_labels_of_what_the_learner_drew_are_made_again_from_the_bag(tmp_path):
+    settings = tiny(
+        steps=800,
+        evaluate_every=0,
+        relabel='drawn',
+        codetr__labelling='window',
+        codetr__window=5,
+        sac__updates_per_step=0.05,
+    )
+    records: list[Record] = []
+    in_process.run(settings, 'calls', observe=records.append)
+    bag = write(tmp_path / 'bag', records)
+
+    said = fit(bag, tmp_path / 'out')
+
+    rows = [r.lengths for r in records if isinstance(r, StepRewards)]
+    assert min(int(lengths.min()) for lengths in rows[1:]) == 1, 'single steps'
+    assert said['recorded_labels'] == {'same': sum(map(len, rows)), 'other': 0}
+    assert verify(bag).sound
 
 
 def test_topics_may_have_been_recorded_in_another_order(a_run, tmp_path):
