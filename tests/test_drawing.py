@@ -110,6 +110,10 @@ def test_whatever_the_learner_draws_has_the_newest_label_and_fewer_are_given(mon
     newest = [r.version for r in records if isinstance(r, StepRewards) and r.part == 0]
     assert len(newest) == learning and len(set(newest)) == learning
 
+    for phase in {r.phase for r in records if isinstance(r, StepRewards)}:
+        sources = [r.source for r in records if isinstance(r, StepRewards) and r.phase == phase]
+        assert len(sources) == settings.simulators, 'a part for each, as queues are deep'
+
     bursts = -(-20 // settings.sac.burst)
     expected = [{version} for version in newest for _ in range(bursts)]
     assert seen.versions == expected

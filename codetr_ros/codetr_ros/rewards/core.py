@@ -211,12 +211,12 @@ class Labeller(Consumer):
         return found
 
     def _numbered(self, phase: int, version: int, found: list[StepRewards]) -> list[StepRewards]:
-        """Join small batches into parts as large as may be, and number them; at least one, if
-        empty.
+        """Join small batches into parts as large as may be, source by source, and number them; at
+        least one, if empty.
         """
         parts: list[list[StepRewards]] = []
         size = PART_BYTES
-        for piece in found:
+        for piece in sorted(found, key=lambda piece: piece.source):
             weight = len(piece.labels) * 4 + len(piece.lengths) * 12
             if size + weight > PART_BYTES or parts[-1][0].source != piece.source:
                 parts.append([])
