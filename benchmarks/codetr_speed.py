@@ -18,8 +18,8 @@ reads and the products that are then masked, which are left out here. Rounds go 
 in turn; the table gives the median round, and the lowest and highest in brackets.
 
 On a GPU (`--device cuda`) a third shape, 4096x4096 by 4096x4096, says what matrices reach there,
-and all of the memory is labelled, 4096 segments at a time. Batches are made on the CPU in any
-case.
+and all of the memory is labelled, 4096 segments at a time. The batches that it learns from are
+made on the CPU.
 
 `--clock cpu` counts the time that the processor worked instead of the time on the wall: for one
 thread on a machine that does other things as well.

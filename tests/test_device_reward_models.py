@@ -11,7 +11,7 @@ from devices import needs_gpu
 from codetr_ros import checkpoints, in_process, rewards
 from codetr_ros.devices import DeviceError
 from codetr_ros.records import CompositeReward, Transitions
-from codetr_ros.rewards import learned
+from codetr_ros.rewards import device_steps, learned
 from codetr_ros.rewards.learned import Learned
 from codetr_ros.trajectories import Trajectories
 
@@ -70,6 +70,42 @@ def test_nothing_is_left_on_the_cpu_that_the_network_meets(method, tokens, dropo
     batch = data.segment_batch(data.segment_ids(), model.context)
     assert model._step_rewards(batch).device.type == 'meta'
     assert model.state()['observation_mean'].device.type == 'meta'
+
+
+@pytest.mark.parametrize('device', ['cpu', pytest.param('cuda', marks=needs_gpu)])
+@pytest.mark.parametrize('method', ['codetr', 'rbt'])
+@pytest.mark.parametrize(
+    'changes', [{}, {'reward_unit': 'raw', 'codetr.context': 'episode', 'codetr.window': 6}]
+)
+def test_labels_put_together_on_the_device_are_those_of_the_host(
+    method, changes, device, monkeypatch
+):
+    """While the ring wraps, old episodes are evicted and a second source appears."""
+    monkeypatch.setattr(device_steps, 'COPIED_AT_ONCE', 7)
+    chosen = settings(method, device).changed(changes)
+    model = rewards.make(chosen, OBSERVATION, ACTION)
+    data = Trajectories(OBSERVATION, ACTION, DELAY, 60, 30)
+    rng = np.random.default_rng(0)
+    for n in range(12):
+        for source in ('sim', 'another')[: 1 + n // 4]:
+            observations = rng.standard_normal((EPISODE + 1, OBSERVATION), np.float32)
+            actions = rng.uniform(-1, 1, (EPISODE, ACTION)).astype(np.float32)
+            # a source's episodes number from 0 on
+            number = n if source == 'sim' else n - 4
+            head = ('run', source, number, n, number, 0, EPISODE)
+            data.append(Transitions(*head, observations, actions, False, True, True, 1))
+            for first in range(0, EPISODE, DELAY):
+                length = min(DELAY, EPISODE - first)
+                score = ('run', source, source, 0, number, first, length, float(rng.normal()))
+                data.score(CompositeReward(*score))
+        data.evict()
+        model.prepare(data)
+        ids = data.segment_ids()
+        batch = data.segment_batch(ids, model.context)
+        expected = model.label(batch)[rewards.segment_steps(batch)]
+        found = model.label_on_device(data, ids)
+        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+    assert min(ring.start for ring in data.sources) > 60
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason='there is a GPU here')

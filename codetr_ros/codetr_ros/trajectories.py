@@ -468,10 +468,19 @@ class Trajectories:
 
     def segment_batch(self, ids: I64, context: int = 0) -> SegmentBatch:
         """Segments by id, each with up to `context` steps of its episode before it."""
+        _, rows, lengths, before = self.places(ids, context)
+        return self._windows(ids, rows, lengths, before, self.scores(ids))
+
+    def places(self, ids: I64, context: int = 0) -> tuple[I64, I64, I64, I64]:
+        """Where the steps of such segments lie.
+
+        Returns:
+            Of each (B,): the place of its source in the order of names, the row of the first step
+            in its ring, the number of steps, and how many of them are context.
+        """
         spans = self._spans(ids)
-        rows, lengths, offsets = spans[:, 0], spans[:, 1], spans[:, 2]
-        before = np.minimum(context, offsets)
-        return self._windows(ids, rows - before, lengths + before, before, self.scores(ids))
+        before = np.minimum(context, spans[:, 2])
+        return ids >> _SOURCE_SHIFT, spans[:, 0] - before, spans[:, 1] + before, before
 
     def scores(self, ids: I64) -> F64:
         """Composite rewards of segments by id."""

@@ -81,8 +81,8 @@ class Codetr(SequenceMethod):
             error = F.mse_loss(predicted, self._scaled(part.values), reduction='sum')
             yield {'reward_loss': error / len(batch.values)}
 
-    def _step_rewards(self, batch: SegmentBatch) -> Tensor:
+    def _read_off(self, observations: Tensor, actions: Tensor, inside: Tensor) -> Tensor:
         """With `label` 'product' those of a segment sum to its predicted composite reward."""
-        weights, rewards = self.network(*self._inputs(batch))
+        weights, rewards = self.network(observations, actions, inside)
         labels: Tensor = weights * rewards if self._codetr.label == 'product' else rewards
         return labels

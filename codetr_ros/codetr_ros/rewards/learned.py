@@ -46,7 +46,7 @@ class Learned(RewardMethod):
     rewards it reads off.
 
     The network lies on `device`, that of the setting `reward_device`; batches are made on the CPU
-    and copied there, labels come back. A state loads on any device.
+    and copied there (but see `DeviceSteps`), labels come back. A state loads on any device.
 
     Raises:
         DeviceError: there is no such device here.
@@ -155,7 +155,10 @@ class Learned(RewardMethod):
 
     def label(self, batch: SegmentBatch) -> F32:
         """Step rewards (B, L) of the segments' steps, 0 elsewhere."""
-        rewards = self._rewards(batch)
+        return self._in_unit(self._rewards(batch))
+
+    def _in_unit(self, rewards: F32) -> F32:
+        """Step rewards in units of c in the unit of labels."""
         if self._settings.reward_unit == 'raw':
             return rewards * np.float32(self.target_scale)
         return rewards
@@ -179,8 +182,11 @@ class Learned(RewardMethod):
         # torch.tensor copies into aligned memory: nothing may depend on where numpy's is
         return torch.tensor(values).to(self.device)
 
-    def _standardised(self, observations: F32) -> Tensor:
-        standardised = (self._put(observations) - self._mean) / self._std
+    def _standardised(self, observations: F32 | Tensor) -> Tensor:
+        """Observations as the network sees them, from an array or from what lies on the device."""
+        if not isinstance(observations, Tensor):
+            observations = self._put(observations)
+        standardised = (observations - self._mean) / self._std
         if self._own.normalise_observations:
             return standardised.clamp(-self.clip, self.clip)
         return standardised

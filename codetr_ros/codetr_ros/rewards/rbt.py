@@ -46,7 +46,7 @@ from codetr_ros.rewards.learned import CLIP
 from codetr_ros.rewards.method import segment_steps
 from codetr_ros.rewards.sequence import SequenceMethod
 from codetr_ros.rewards.transformer import CausalTransformer, SequenceWeights, initialise
-from codetr_ros.trajectories import SegmentBatch, Trajectories
+from codetr_ros.trajectories import Trajectories
 
 
 class Rbt(SequenceMethod):
@@ -94,8 +94,8 @@ class Rbt(SequenceMethod):
             'state_loss': self._settings.rbt.state_loss_weight * state_loss,
         }
 
-    def _step_rewards(self, batch: SegmentBatch) -> Tensor:
-        rewards: Tensor = self.network(*self._inputs(batch))[0]
+    def _read_off(self, observations: Tensor, actions: Tensor, inside: Tensor) -> Tensor:
+        rewards: Tensor = self.network(observations, actions, inside)[0]
         return rewards
 
 

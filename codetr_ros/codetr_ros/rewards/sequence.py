@@ -1,16 +1,19 @@
 """What the methods with a transformer over the steps of a window share: CoDeTr and RBT."""
 
 import math
+from abc import abstractmethod
 from collections.abc import Iterator
 from typing import ClassVar
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from codetr_ros import freed_memory
 from codetr_ros.config import CodetrSettings, Settings
 from codetr_ros.records import F32
+from codetr_ros.rewards.device_steps import DeviceSteps
 from codetr_ros.rewards.learned import Learned
 from codetr_ros.rewards.method import RewardModelError, segment_steps
 from codetr_ros.trajectories import SegmentBatch, Trajectories
@@ -49,16 +52,36 @@ class SequenceMethod(Learned):
         self.label_batch = settings.codetr.label_batch
         self._whole_window = whole_window
         self._positions = max(settings.delay + context, settings.codetr.window)
+        self._on_device: DeviceSteps | None = None
         freed_memory.keep()
         super().__init__(settings, observation_size, action_size)
 
     def label_passes(self, memory: Trajectories, ids: NDArray[np.int64]) -> Iterator[F32]:
         """Labels of the segments' steps, from whole segments or from windows (`labelling`)."""
-        if self._codetr.labelling == 'segment':
+        if self._codetr.labelling == 'segment' and self.device.type != 'cpu':
+            yield self.label_on_device(memory, ids)
+        elif self._codetr.labelling == 'segment':
             yield from super().label_passes(memory, ids)
         else:
             for batch in memory.windows(ids, self._codetr.window, self.label_batch):
                 yield self.label_windows(batch)
+
+    def label_on_device(self, memory: Trajectories, ids: NDArray[np.int64]) -> F32:
+        """The same labels of whole segments, put together where the network lies."""
+        self._require_prepared()
+        if self._on_device is None or self._on_device.memory is not memory:
+            self._on_device = DeviceSteps(memory, self.device)
+        self._on_device.update()
+        self.network.eval()
+        labels = []
+        longest = int(memory.lengths(ids).max()) + self.context
+        with torch.inference_mode():
+            for some in np.array_split(ids, self._part_count(len(ids), longest)):
+                observations, actions, there, own = self._on_device.read(some, self.context)
+                inside = there if self._whole_window else own
+                rewards = self._read_off(self._standardised(observations), actions, inside)
+                labels.append(rewards[own].cpu().numpy())
+        return self._in_unit(np.concatenate(labels))
 
     @property
     def single_steps(self) -> bool:
@@ -82,13 +105,23 @@ class SequenceMethod(Learned):
 
         They stay in the processor's cache, and their memory is used again.
         """
-        most = PART_BYTES if self.device.type == 'cpu' else DEVICE_PART_BYTES
         windows, steps = batch.actions.shape[:2]
+        size = -(-windows // self._part_count(windows, steps))
+        return [batch.part(slice(i, i + size)) for i in range(0, windows, size)]
+
+    def _part_count(self, windows: int, steps: int) -> int:
+        """Into how many parts windows of so many steps are cut."""
+        most = PART_BYTES if self.device.type == 'cpu' else DEVICE_PART_BYTES
         tokens = steps * (2 if self._codetr.tokens == 'pair' else 1)
         widest = max(4 * self._codetr.embedding, self._codetr.heads * tokens) * tokens * 4
-        count = -(-windows // max(1, most // widest))
-        size = -(-windows // count)
-        return [batch.part(slice(i, i + size)) for i in range(0, windows, size)]
+        return -(-windows // max(1, most // widest))
+
+    @abstractmethod
+    def _read_off(self, observations: Tensor, actions: Tensor, inside: Tensor) -> Tensor:
+        """Step rewards (B, L) in units of c, of the network's inputs as `_inputs` gives them."""
+
+    def _step_rewards(self, batch: SegmentBatch) -> Tensor:
+        return self._read_off(*self._inputs(batch))
 
     def _learning_rate(self) -> float:
         return learning_rate(self._codetr, self.gradient_steps)
