@@ -9,6 +9,7 @@ The other maxima are variants by name.
 
 # ruff: noqa: ARG001  (every formula takes the same arguments, so that one is as good as another)
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -98,7 +99,7 @@ def composite(name: str, rewards: F64, beta: float, delay: int) -> float:
         )
     with np.errstate(over='ignore', invalid='ignore'):
         value = formula(np.asarray(rewards, np.float64), beta, delay)
-    if not np.isfinite(value):
+    if not math.isfinite(value):
         raise CompositeError(
             f'composite={name} of rewards between {rewards.min()} and {rewards.max()} is '
             f'{value}: it must be finite; scale the rewards of the task down'

@@ -85,7 +85,8 @@ class Environment(ABC):
         self.control_period = control_period
         self._middle = (high + low) / 2
         self._half = (high - low) / 2
-        self._scaled = bool((self._middle != 0).any() or (self._half != 1).any())
+        self._shifted = bool((self._middle != 0).any())
+        self._scaled = self._shifted or bool((self._half != 1).any())
         self._steps = 0
 
     def reset(self, seed: int) -> F32:
@@ -115,11 +116,11 @@ class Environment(ABC):
             TaskError: the observation or the reward is not finite.
         """
         self._steps += 1
-        scaled = (
-            self._middle + self._half * action.reshape(self._half.shape)
-            if self._scaled
-            else action
-        )
+        scaled: NDArray[Any] = action
+        if self._scaled:
+            scaled = self._half * action.reshape(self._half.shape)
+        if self._shifted:
+            scaled = self._middle + scaled
         observation, reward, terminated = self._step(scaled)
         if not math.isfinite(reward):
             raise TaskError(self._not_finite('reward', reward))
