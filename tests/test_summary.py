@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bags.making import ours
 
 from codetr_ros import config, report, run_folder, summary
+from codetr_ros.cli import train
 from codetr_ros.config import Settings
 from codetr_ros.progress import Progress, duration
 from codetr_ros.records import Commit, EpisodeResult, Presence, Record, metrics
@@ -346,3 +348,39 @@ def test_progress_on_a_terminal_shows_phase_evaluation_losses_and_time(
 )
 def test_durations_are_said_as_people_do(seconds: float, said: str) -> None:
     assert duration(seconds) == said
+
+
+def told(made: Summary) -> tuple[dict[str, Any], str]:
+    """What is said of a run, without what its process takes."""
+    return {k: v for k, v in made.build({}).items() if k != 'processes'}, made.metrics_csv()
+
+
+def test_a_run_that_is_told_twice_and_in_another_order_is_the_same_run():
+    once, twice = Summary(SETTINGS, 'r', False, Clock()), Summary(SETTINGS, 'r', False, Clock())
+    for record in a_run():
+        once.receive(record)
+    for record in [*reversed(a_run()), *a_run()]:
+        twice.receive(record)
+    assert told(once) == told(twice)
+
+
+def test_what_was_not_heard_is_taken_from_the_bag(tmp_path):
+    """Who listens to a run may be found after its first messages have gone out."""
+    bag = ours(tmp_path / run_folder.BAG, a_run())
+    heard, late = Summary(SETTINGS, 'r', False, Clock()), Summary(SETTINGS, 'r', False, Clock())
+    stream = io.StringIO()
+    progress = Progress(SETTINGS, stream, live=False, clock=Clock())
+    for record in a_run():
+        heard.receive(record)
+    for record in a_run()[3:]:
+        late.receive(record)
+    assert late.build({})['random'] is None
+    train._complete(late, tmp_path, progress)
+    assert told(late) == told(heard)
+    assert not stream.getvalue()
+
+    file = next(bag.glob('*.mcap'))
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    train._complete(late, tmp_path, progress)
+    assert told(late) == told(heard)
+    assert 'what was heard' in stream.getvalue()

@@ -31,22 +31,23 @@ _FAULTS = ('lost', 'duplicated', 'refused')
 
 @dataclass
 class _Results:
-    """Episodes of one evaluation."""
+    """Episodes of an evaluation or of a phase's training: each once, however often told."""
 
     version: int
-    true: list[float] = field(default_factory=list)
-    composite: list[float] = field(default_factory=list)
-    score: list[float] = field(default_factory=list)
-    length: list[int] = field(default_factory=list)
+    told: dict[tuple[str, int], EpisodeResult] = field(default_factory=dict)
 
     def add(self, result: EpisodeResult) -> None:
-        self.true.append(result.true_return)
-        self.composite.append(result.composite_return)
-        self.score.append(result.score)
-        self.length.append(result.length)
+        self.told[result.source, result.episode] = result
+
+    @property
+    def episodes(self) -> list[EpisodeResult]:
+        """In an order that does not depend on who was heard first."""
+        return [result for _, result in sorted(self.told.items())]
 
     def row(self, step: int) -> dict[str, Any]:
-        true, score = np.array(self.true), np.array(self.score)
+        episodes = self.episodes
+        true = np.array([e.true_return for e in episodes])
+        score = np.array([e.score for e in episodes])
         return {
             'step': step,
             'version': self.version,
@@ -54,11 +55,11 @@ class _Results:
             'true_return_std': float(true.std()),
             'true_return_min': float(true.min()),
             'true_return_max': float(true.max()),
-            'composite_return_mean': float(np.mean(self.composite)),
+            'composite_return_mean': float(np.mean([e.composite_return for e in episodes])),
             'score_mean': float(score.mean()),
             'score_std': float(score.std()),
-            'length_mean': float(np.mean(self.length)),
-            'episodes': len(self.true),
+            'length_mean': float(np.mean([e.length for e in episodes])),
+            'episodes': len(episodes),
         }
 
 
@@ -86,20 +87,21 @@ class Summary:
         self._began = clock()
         self._evaluations: dict[int, _Results] = {}  # by step
         self._random: _Results | None = None
-        self._training: dict[int, list[EpisodeResult]] = defaultdict(list)  # by phase
+        self._training: dict[int, _Results] = {}  # by phase
         self._metrics: dict[int, dict[tuple[str, str, str], float]] = defaultdict(dict)  # by phase
         self._phases = 0
         # elsewhere true rewards and labels do not meet
         self._recovery = Recovery(settings) if in_process else None
 
     def receive(self, record: Record) -> None:
-        """Take note of a record of the run, of whatever kind."""
+        """Take note of a record of the run, of whatever kind; once more changes nothing."""
         if self._recovery is not None:
             self._recovery.receive(record)
         if isinstance(record, EpisodeResult):
             if record.purpose == 'training':
                 # the last phase that a step belongs to: step 1000 of 1000-step phases ends phase 0
-                self._training[max(0, record.step - 1) // self.settings.phase_steps].append(record)
+                phase = max(0, record.step - 1) // self.settings.phase_steps
+                self._training.setdefault(phase, _Results(record.version)).add(record)
             elif record.purpose == 'random':
                 self._random = self._random or _Results(record.version)
                 self._random.add(record)
@@ -215,7 +217,8 @@ class Summary:
             for (role, node, name), value in said.items():
                 place = role if len(nodes[role]) == 1 else node.rsplit('/', 1)[-1]
                 rows[phase][f'{place}.{name}'] = value
-        for phase, episodes in self._training.items():
+        for phase, results in self._training.items():
+            episodes = results.episodes
             rows[phase] |= {
                 'training.true_return_mean': float(np.mean([e.true_return for e in episodes])),
                 'training.score_mean': float(np.mean([e.score for e in episodes])),
