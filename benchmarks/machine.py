@@ -13,17 +13,17 @@ LOUD = 0.5
 """Load average above which a machine is not idle."""
 
 
-def commit() -> str:
+def commit(checkout: Path = HERE) -> str:
     """The commit that is measured, marked where tracked files other than results have changed."""
-    name = _git('describe', '--always', '--exclude', '*').stdout.strip()
-    code = _git('diff', '--quiet', 'HEAD', '--', ':/', ':(top,exclude)benchmarks/results')
+
+    def git(*arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            ['git', *arguments], cwd=checkout, capture_output=True, text=True, check=False
+        )
+
+    name = git('describe', '--always', '--exclude', '*').stdout.strip()
+    code = git('diff', '--quiet', 'HEAD', '--', ':/', ':(top,exclude)benchmarks/results')
     return name + ('-dirty' if code.returncode else '')
-
-
-def _git(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        ['git', *arguments], cwd=HERE, capture_output=True, text=True, check=False
-    )
 
 
 def processor() -> str:

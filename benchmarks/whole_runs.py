@@ -20,7 +20,6 @@ that out elsewhere, and run it with the same packages:
 import argparse
 import csv
 import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -45,12 +44,6 @@ def environment(checkout: Path) -> dict[str, str]:
     return os.environ | {'PYTHONPATH': os.pathsep.join([*folders, *others])}
 
 
-def commit(checkout: Path) -> str:
-    """The commit that is checked out."""
-    command = ['git', '-C', str(checkout), 'rev-parse', '--short', 'HEAD']
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-
-
 def main() -> int:
     """The command line; the exit code."""
     parser = argparse.ArgumentParser(
@@ -63,7 +56,7 @@ def main() -> int:
     facts = machine.facts(machine.load(), PACKAGES)
     variables = None
     if arguments.checkout:
-        facts['commit of the run'] = commit(arguments.checkout)
+        facts['commit of the run'] = machine.commit(arguments.checkout)
         variables = environment(arguments.checkout.absolute())
     found = throughput.whole_run(arguments.flags, in_process=False, environment=variables)
     seconds, wall = stages(found), found['wall']
