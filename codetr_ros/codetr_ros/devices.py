@@ -4,7 +4,7 @@ import torch
 
 
 class DeviceError(ValueError):
-    """A device that is not here: names value, field and remedy."""
+    """A device that is not here, or has no room: names value, field and remedy."""
 
 
 def usable(device: str, field: str = 'device') -> torch.device:

@@ -1,6 +1,7 @@
 """The steps and segments of one source: where the memory D keeps its arrays."""
 
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,6 +90,11 @@ class SourceRing:
         """The number of the scored segment whose first step lies in a row that is held."""
         number = int(self._beginning[row % self.capacity])
         return number - 1 if number else None
+
+    def slots_from(self, row: int, most: int) -> Iterator[I64]:
+        """Slots of the steps held from a row on, in order, at most so many at a time."""
+        for start in range(max(row, self.start), self.end, most):
+            yield np.arange(start, min(start + most, self.end)) % self.capacity
 
     def segments_over(self, rows: I64) -> I64:
         """Where in the table the scored segments stand that rows (B,) lie in; each lies in one."""

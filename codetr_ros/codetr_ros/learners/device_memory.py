@@ -50,7 +50,7 @@ class DeviceMemory:
         if not stayed:
             self._allocate(rings)
         for i, (ring, rows) in enumerate(zip(rings, self._blocks(rings), strict=True)):
-            self._add(ring, rows, max(self._copied[i], ring.start))
+            self._add(ring, rows, self._copied[i])
             self._copied[i] = ring.end
             held = min(ring.end, ring.capacity)
             rows[:held, -1] = torch.from_numpy(ring.labels[:held]).to(self._device)
@@ -84,8 +84,7 @@ class DeviceMemory:
         return torch.split(self.rows, [ring.capacity for ring in rings])
 
     def _add(self, ring: SourceRing, rows: Tensor, first: int) -> None:
-        for start in range(first, ring.end, COPIED_AT_ONCE):
-            slots = np.arange(start, min(start + COPIED_AT_ONCE, ring.end)) % ring.capacity
+        for slots in ring.slots_from(first, COPIED_AT_ONCE):
             steps = self.memory.steps_in(ring, slots)
             going_on = np.float32(self._discount) * (1 - steps.terminated.astype(np.float32))
             last = np.stack([going_on, steps.rewards], 1)

@@ -42,8 +42,7 @@ class DeviceSteps:
             self._allocate(rings)
         blocks = torch.split(self.rows, [ring.capacity for ring in rings])
         for i, (ring, rows) in enumerate(zip(rings, blocks, strict=True)):
-            for start in range(max(self._copied[i], ring.start), ring.end, COPIED_AT_ONCE):
-                slots = np.arange(start, min(start + COPIED_AT_ONCE, ring.end)) % ring.capacity
+            for slots in ring.slots_from(self._copied[i], COPIED_AT_ONCE):
                 new = np.concatenate([ring.observations[slots], ring.actions[slots]], 1)
                 rows[torch.from_numpy(slots).to(self._device)] = torch.tensor(new).to(self._device)
             self._copied[i] = ring.end
