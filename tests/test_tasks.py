@@ -42,8 +42,9 @@ class Counting(gymnasium.Env):
         return self.seen.reshape(self.shape), {}
 
     def step(self, action):
+        assert self.action_space.contains(action)
         self.steps += 1
-        self.seen[:] = self.steps, action[0]  # in place, as some environments do
+        self.seen[:] = self.steps, action.flat[0]  # in place, as some environments do
         if self.steps == self.at:
             self.seen[0] += self.said
             return self.seen, self.reward, False, self.truncated, {}
@@ -194,6 +195,14 @@ def test_an_observation_of_two_dimensions_is_flattened(counting):
     )
     assert environment.observation_size == 2
     assert environment.reset(seed=0).shape == (2,)
+
+
+@pytest.mark.parametrize('bound', [1, 2], ids=['as they are', 'scaled'])
+def test_an_action_of_two_dimensions_arrives_in_its_shape(counting, bound):
+    environment = make(counting(action_space=spaces.Box(-bound, bound, (1, 2))))
+    environment.reset(seed=0)
+    assert environment.action_size == 2
+    assert environment.step(np.array([0.5, 0.0], np.float32))[0][1] == 0.5 * bound
 
 
 def test_any_other_id_with_boxes_works_with_the_horizon_of_its_spec():

@@ -83,8 +83,8 @@ class Environment(ABC):
         self.observation_size = observation_size
         self.action_size = int(low.size)
         self.control_period = control_period
-        self._middle = (high + low) / 2
-        self._half = (high - low) / 2
+        self._middle = (high + low).reshape(-1) / 2
+        self._half = (high - low).reshape(-1) / 2
         self._shifted = bool((self._middle != 0).any())
         self._scaled = self._shifted or bool((self._half != 1).any())
         self._steps = 0
@@ -118,7 +118,7 @@ class Environment(ABC):
         self._steps += 1
         scaled: NDArray[Any] = action
         if self._scaled:
-            scaled = self._half * action.reshape(self._half.shape)
+            scaled = self._half * action
         if self._shifted:
             scaled = self._middle + scaled
         observation, reward, terminated = self._step(scaled)
@@ -148,7 +148,7 @@ class Environment(ABC):
 
     @abstractmethod
     def _step(self, action: NDArray[Any]) -> tuple[F32, float, bool]:
-        """The same, with reward and termination, after an action within the bounds."""
+        """The same, with reward and termination, after an action (A,) within the bounds."""
 
     @abstractmethod
     def close(self) -> None:
@@ -188,7 +188,6 @@ class GymnasiumEnvironment(Environment):
         box = spaces['action']
         size = math.prod(spaces['observation'].shape)
         super().__init__(task, size, box.low, box.high, _period(self._env))
-        self._scaled = self._scaled or box.low.ndim != 1
         self._stepper = stepper(self._env)
 
     def _reset(self, seed: int) -> F32:
@@ -197,7 +196,8 @@ class GymnasiumEnvironment(Environment):
     def _step(self, action: NDArray[Any]) -> tuple[F32, float, bool]:
         if self._stepper is not None:
             return self._stepper.step(action)
-        observation, reward, terminated, truncated, _ = self._env.step(action)
+        shaped = action.reshape(self._env.action_space.shape)
+        observation, reward, terminated, truncated, _ = self._env.step(shaped)
         if truncated and self._steps < self.horizon:
             raise TaskError(
                 f'task {self.name!r} truncated an episode itself, at step {self._steps} of '
