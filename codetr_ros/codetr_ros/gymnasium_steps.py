@@ -60,7 +60,7 @@ class Stepper(ABC):
         """
 
     def _simulate(self, action: NDArray[np.float32]) -> None:
-        self._ctrl[:] = action
+        self._ctrl[...] = action
         self._advance()
 
 
