@@ -235,6 +235,14 @@ def test_a_hundred_compiled_updates_end_where_those_of_the_plain_form_end(
     check_close(flat, plain, 1e-4)
 
 
+@pytest.mark.slow
+def test_what_is_compiled_at_the_start_serves_every_update():
+    _, sac = compiled_pair(*SIZES[0])
+    with torch._dynamo.config.patch(error_on_recompile=True):
+        sac.update(make_batch(32, 5, 3, 0))
+        burst(sac, 64, make_batch(32 * 64, 5, 3, 0))
+
+
 COMPILED_BURST = """
 import sys
 sys.path.insert(0, sys.argv[1])

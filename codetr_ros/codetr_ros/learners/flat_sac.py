@@ -72,9 +72,12 @@ class FlatSAC(SAC):
             self._compile(self._example(observation_size, action_size))
 
     def _example(self, observation_size: int, action_size: int) -> tuple[Tensor, ...]:
-        """Arguments of `_update` that lie in memory as those of every update will."""
-        s, a = torch.zeros(self.batch, observation_size), torch.zeros(self.batch, action_size)
-        return s, a, s[:, 0].clone(), s, s[:, 0].clone(), torch.zeros(2, *a.shape)
+        """Arguments of `_update` that lie in memory as those of every update will: each in memory
+        of its own, as what is compiled for two in one place is of no use to others.
+        """
+        B, O, A = self.batch, observation_size, action_size  # noqa: E741
+        shapes = (B, O), (B, A), (B,), (B, O), (B,), (2, B, A)
+        return tuple(map(torch.zeros, shapes))
 
     @torch.no_grad()
     def _compile(self, example: tuple[Tensor, ...]) -> None:
