@@ -10,16 +10,17 @@ observations, 8 actions), for each delay n:
   - label: whole segments of the memory labelled as the reward node labels them
 
 Each is set against its floor: the floating point operations that it needs
-(`codetr_ros.rewards.cost`), at the rate that products of float32 matrices reach in the same round.
-That rate is the higher one of two shapes: 256x256 by 256x256, and the tokens of 64 segments of 25
-steps by the MLP's weights. A ratio of 1 is as fast as the products alone. `as written` is the
-same ratio with the operations of a network that is written plainly, with the tokens that nobody
-reads and the products that are then masked, which are left out here. Rounds go through everything
-in turn; the table gives the median round, and the lowest and highest in brackets.
+(`codetr_ros.rewards.cost`), at the rate that products of matrices of the same precision reach in
+the same round. That rate is the higher one of two shapes: 256x256 by 256x256, and the tokens of 64
+segments of 25 steps by the MLP's weights. A ratio of 1 is as fast as the products alone. `as
+written` is the same ratio with the operations of a network that is written plainly, with the
+tokens that nobody reads and the products that are then masked, which are left out here. Rounds go
+through everything in turn; the table gives the median round, and the lowest and highest in
+brackets.
 
 On a GPU (`--device cuda`) a third shape, 4096x4096 by 4096x4096, says what matrices reach there,
-and all of the memory is labelled, 4096 segments at a time. The batches that it learns from are
-made on the CPU.
+and a memory of a million steps is labelled whole, 4096 segments at a time. The batches that it
+learns from are made on the CPU.
 
 `--clock cpu` counts the time that the processor worked instead of the time on the wall: for one
 thread on a machine that does other things as well.
@@ -48,17 +49,18 @@ from codetr_ros.trajectories import Trajectories
 RESULTS = Path(__file__).parent / 'results'
 OBSERVATION, ACTION = 27, 8  # Ant
 DELAYS = (5, 25, 50, 100, 200, 500)
-EPISODE, EPISODES = 1000, 64
+EPISODE = 1000
+EPISODES, EPISODES_ON_GPU = 64, 1000
 LABELLED = 6400  # steps, or 64 segments where these are more
 SHAPES = (256, 256, 256), (64 * 50, 256, 1024)
 LARGE = 4096, 4096, 4096  # for a GPU
 
 
-def memory(delay: int) -> Trajectories:
+def memory(delay: int, episodes: int) -> Trajectories:
     """Scored episodes of random steps."""
-    found = Trajectories(OBSERVATION, ACTION, delay, EPISODE * EPISODES, EPISODE)
+    found = Trajectories(OBSERVATION, ACTION, delay, EPISODE * episodes, EPISODE)
     rng = np.random.default_rng(0)
-    for n in range(EPISODES):
+    for n in range(episodes):
         observations = rng.standard_normal((EPISODE + 1, OBSERVATION), np.float32)
         actions = rng.uniform(-1, 1, (EPISODE, ACTION)).astype(np.float32)
         head = ('run', 'sim', n, n, n, 0, EPISODE)
@@ -74,12 +76,13 @@ class Work:
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        self.memory = memory(settings.delay)
+        on_cpu = settings.reward_device == 'cpu'
+        self.memory = memory(settings.delay, EPISODES if on_cpu else EPISODES_ON_GPU)
         self.model = Codetr(settings, OBSERVATION, ACTION)
         self.model.prepare(self.memory)
         segments = max(LABELLED // settings.delay, 64)
         ids = self.memory.segment_ids()
-        self.ids = ids[:segments] if settings.reward_device == 'cpu' else ids
+        self.ids = ids[:segments] if on_cpu else ids
         self.steps = 0
 
     def gradient(self) -> tuple[int, int]:
@@ -105,14 +108,15 @@ class Work:
         return Cost(*size), Cost(*size, plain=True)
 
 
-def sgemm(device: torch.device) -> float:
-    """Operations per second of products of float32 matrices."""
+def products(device: torch.device, precision: str) -> float:
+    """Operations per second of products of matrices of a precision."""
     best = 0.0
+    options: dict[str, Any] = {'device': device, 'dtype': getattr(torch, precision)}
     on_gpu = device.type != 'cpu'
     for rows, inner, columns in (*SHAPES, LARGE) if on_gpu else SHAPES:
-        a = torch.randn(rows, inner, device=device)
-        b = torch.randn(inner, columns, device=device)
-        out = torch.empty(rows, columns, device=device)
+        a = torch.randn(rows, inner, **options)
+        b = torch.randn(inner, columns, **options)
+        out = torch.empty(rows, columns, **options)
         flops = 2 * rows * inner * columns
         times = max(1, round((2e12 if on_gpu else 5e9) / flops))
         torch.mm(a, b, out=out)
@@ -155,17 +159,18 @@ def measure(
     rows = []
     for n in range(rounds):
         for name, (task, units) in tasks.items():
-            before = sgemm(where)
+            before = products(where, precision)
             began = CLOCKS[clock]()
             flops, plain = task()
             wait(where)
             seconds = CLOCKS[clock]() - began
-            floor = (before + sgemm(where)) / 2  # a virtual machine's speed changes within seconds
+            # a virtual machine's speed changes within seconds
+            floor = (before + products(where, precision)) / 2
             rows.append(
                 {'delay': delay, 'threads': threads, 'precision': precision}
                 | {'what': name, 'round': n}
                 | {'seconds': round(seconds, 5), 'units': units, 'flops': flops}
-                | {'sgemm_gflops': round(floor / 1e9, 2)}
+                | {'products_gflops': round(floor / 1e9, 2)}
                 | {'ratio': round(flops / seconds / floor, 4)}
                 | {'plain_ratio': round(plain / seconds / floor, 4)}
             )
@@ -175,15 +180,15 @@ def measure(
 
 SIZE = ('delay', 'threads', 'precision')
 HEAD = (
-    '| n | threads | precision | sgemm [GFLOP/s] | gradient steps/s | of the floor | as written '
-    '| labelled steps/s | of the floor | as written |\n|---|---|---|---|---|---|---|---|---|---|'
+    '| n | threads | precision | products [GFLOP/s] | gradient steps/s | of the floor '
+    '| as written | labelled steps/s | of the floor | as written |\n' + 10 * '|---' + '|'
 )
 
 
 def line(rows: list[dict[str, Any]]) -> str:
     """The table's line for one delay, number of threads and precision."""
     cells = [str(rows[0][name]) for name in SIZE]
-    cells.append(f'{statistics.median(row["sgemm_gflops"] for row in rows):.0f}')
+    cells.append(f'{statistics.median(row["products_gflops"] for row in rows):.0f}')
     for what in ('gradient', 'label'):
         mine = [row for row in rows if row['what'] == what]
         rate = statistics.median(row['units'] / row['seconds'] for row in mine)

@@ -67,6 +67,7 @@ class DeviceMemory:
         """
         size = sum(ring.capacity for ring in rings)
         width = 2 * self.memory.observation_size + self.memory.action_size + 2
+        self.rows = self._labelled = torch.empty(0)  # the old ones go before the new ones come
         try:
             self.rows = torch.full((size, width), torch.nan, device=self._device)
             self._labelled = torch.zeros(size, dtype=torch.int64, device=self._device)

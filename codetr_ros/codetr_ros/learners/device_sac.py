@@ -10,7 +10,9 @@ generator. The update itself and the states are the same. On a CPU the same func
 being recorded. `sac.compile` compiles the update for the GPU before it is recorded.
 """
 
-from collections.abc import Callable
+import gc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TypeAlias
 
 import torch
@@ -111,6 +113,9 @@ def cuda_graph(call: Call) -> Call:
     It must read and write tensors that stay where they are, and wait for nothing. Random numbers
     go on from one replay to the next: a graph knows the GPU's default generator, and a seed that
     is set between two replays counts for the second.
+
+    Each recording has a stream of its own: torch frees what cuBLAS keeps for a stream together
+    with the first of its graphs that goes, and the others would still use it.
     """
     stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
     stream.wait_stream(torch.cuda.current_stream())
@@ -119,6 +124,21 @@ def cuda_graph(call: Call) -> Call:
             call()
     torch.cuda.current_stream().wait_stream(stream)
     graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph, stream=stream):
+    with _nothing_freed(), torch.cuda.graph(graph, stream=stream):
         call()
     return graph.replay
+
+
+@contextmanager
+def _nothing_freed() -> Iterator[None]:
+    """Free what nobody uses any more before, not meanwhile: CUDA ends a recording during which
+    another graph goes, and learners go when garbage is collected, as they refer to themselves.
+    """
+    gc.collect()
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collecting:
+            gc.enable()

@@ -107,11 +107,11 @@ class OffPolicy(ABC):
         """
         settings = self._settings
         due = drawing.updates_of(settings, phase)
+        began = time.perf_counter()
         if not self._prepare(memory):
             self.counters[f'updates skipped, {self.lacking}'] += due
             return
         totals: dict[str, Tensor] = {}
-        began = time.perf_counter()
         for burst in drawing.bursts(settings, phase):
             seed_torch(settings.seed, 'learner', phase, burst.first)
             add(totals, self._burst(memory, burst.rng, burst.updates))

@@ -50,6 +50,7 @@ class DeviceSteps:
     def _allocate(self, rings: list[SourceRing]) -> None:
         size = sum(ring.capacity for ring in rings)
         width = self.memory.observation_size + self.memory.action_size
+        self.rows = torch.empty(0)  # the old ones go before the new ones come
         try:
             self.rows = torch.zeros(size, width, device=self._device)
         except RuntimeError as error:  # torch's own where a GPU is out of memory
@@ -69,10 +70,8 @@ class DeviceSteps:
             Observations (B, L, O) before each step and actions (B, L, A), 0 in the padding on the
             right, and which steps (B, L) there are, and which of them are the segments' own.
         """
-        places = self.memory.places(ids, context)
-        source, row, length, before = (
-            torch.from_numpy(each).to(self._device)[:, None] for each in places
-        )
+        places = np.stack(self.memory.places(ids, context))  # (4, B)
+        source, row, length, before = torch.from_numpy(places).to(self._device)[..., None]
         step = torch.arange(int(places[2].max()), device=self._device)
         there = step < length  # (B, L)
         slots = self._firsts[source] + (row + step) % self._capacities[source]

@@ -136,9 +136,10 @@ class Learned(RewardMethod):
         self._optimiser.zero_grad()
         said: dict[str, float] = {}
         for terms in self._terms(memory, rng):
+            torch.stack(list(terms.values())).sum().backward()  # type: ignore[no-untyped-call]
+            # read now only: on a GPU whoever reads waits
             for name, term in terms.items():
                 said[name] = said.get(name, 0.0) + float(term.detach())
-            torch.stack(list(terms.values())).sum().backward()  # type: ignore[no-untyped-call]
         for name, value in said.items():
             if not math.isfinite(value):
                 raise RewardModelError(

@@ -24,6 +24,8 @@ window is looked at: half of what the C library serves from memory that it has (
 """
 DEVICE_PART_BYTES = 1 << 30
 """The same on another device than the CPU, which wants much to do at a time (not measured)."""
+PART_WINDOWS = 65_535
+"""Most windows at a time: so many sequences CUDA's kernels for attention take."""
 
 
 class SequenceMethod(Learned):
@@ -114,7 +116,7 @@ class SequenceMethod(Learned):
         most = PART_BYTES if self.device.type == 'cpu' else DEVICE_PART_BYTES
         tokens = steps * (2 if self._codetr.tokens == 'pair' else 1)
         widest = max(4 * self._codetr.embedding, self._codetr.heads * tokens) * tokens * 4
-        return -(-windows // max(1, most // widest))
+        return -(-windows // min(PART_WINDOWS, max(1, most // widest)))
 
     @abstractmethod
     def _read_off(self, observations: Tensor, actions: Tensor, inside: Tensor) -> Tensor:
