@@ -132,7 +132,8 @@ class CodetrSettings(Group):
         256,
         ge=1,
         le=65536,
-        description='segments or windows labelled between two looks at arriving messages',
+        description='segments or windows labelled between two looks at arriving messages; a GPU '
+        'wants thousands',
     )
     precision: Literal['float32', 'bfloat16'] = Field(
         'float32',
