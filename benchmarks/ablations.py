@@ -2,7 +2,7 @@
 
     .venv/bin/python benchmarks/ablations.py run readings --workers 2       # twenty minutes
     .venv/bin/python benchmarks/ablations.py table readings
-    .venv/bin/python benchmarks/ablations.py run savings --workers 2        # half an hour
+    .venv/bin/python benchmarks/ablations.py run savings --workers 2        # 45 minutes
     .venv/bin/python benchmarks/ablations.py table savings
 
 Two studies, each on one task, with every variant under the same seeds, as cells of `codetr
@@ -127,7 +127,7 @@ SAVINGS = Study(
     task='HalfCheetah-v5',
     delay=25,
     steps=30_000,
-    seeds=(0, 1, 2, 3, 4),
+    seeds=tuple(range(10)),
     composites=('sum',),
     config={'base': 'quick', 'warmup_steps': 1000, 'evaluate_every': 5000},
     variants={
