@@ -5,14 +5,16 @@ from scipy import stats
 
 from codetr_ros import in_process
 from codetr_ros.records import Record, StepRewards, TrueRewards
-from codetr_ros.recovery import Recovery
+from codetr_ros.recovery import Recovery, RecoveryError
 
 SETTINGS = tiny(delay=2, steps=600, phase_steps=100, warmup_steps=100, evaluate_every=100)
 
 
-def true_rewards(episode: int, first_step: int, *rewards: float, source: str = 'sim'):
+def true_rewards(
+    episode: int, first_step: int, *rewards: float, source: str = 'sim', phase: int = 0
+) -> TrueRewards:
     values = np.array(rewards, np.float32)
-    return TrueRewards('run', source, 0, 0, episode, first_step, values)
+    return TrueRewards('run', source, 0, phase, episode, first_step, values)
 
 
 def labels(phase: int, *segments: tuple[int, int, list[float]], **changes) -> StepRewards:
@@ -26,8 +28,8 @@ def labels(phase: int, *segments: tuple[int, int, list[float]], **changes) -> St
     return step_rewards(phase=phase, **fields, labels=values, **changes)
 
 
-def observe(*records: Record, settings=SETTINGS) -> list[dict[str, float]]:
-    recovery = Recovery(settings)
+def observe(*records: Record, settings=SETTINGS, recorded=False) -> list[dict[str, float]]:
+    recovery = Recovery(settings, recorded)
     for record in records:
         recovery.receive(record)
     return recovery.rows
@@ -99,6 +101,67 @@ def test_only_the_newest_steps_that_the_memory_holds_are_compared():
 
     assert rows[0]['steps'] == 4
     assert rows[0]['pearson'] == pytest.approx(1)
+
+
+def test_steps_that_a_version_has_labelled_no_more_have_left_the_memory_and_do_not_count():
+    records = [
+        true_rewards(0, 0, 1.0, 2.0, 3.0, 4.0),
+        labels(0, (0, 0, [9.0, -9.0]), (0, 2, [3.0, 4.0]), version=0),
+        labels(1, (0, 2, [3.5, 4.0]), version=1),
+    ]
+    assert [row['steps'] for row in observe(*records)] == [4, 2]
+    some = SETTINGS.changed({'relabel_steps': 2})
+    assert [row['steps'] for row in observe(*records, settings=some)] == [4, 4]
+
+
+def test_true_rewards_may_come_before_the_labels_of_earlier_phases():
+    settings = SETTINGS.changed({'memory_steps': 2})
+    first, second = true_rewards(0, 0, 1.0, 2.0), true_rewards(1, 0, 4.0, 3.0, phase=1)
+    said = labels(0, (0, 0, [1.0, 2.0])), labels(1, (1, 0, [4.0, 3.5]))
+
+    in_turn = observe(first, said[0], second, said[1], settings=settings)
+    assert in_turn == observe(first, second, *said, settings=settings)
+    assert [row['steps'] for row in in_turn] == [2, 2]
+
+
+def test_what_a_bag_lacks_labels_of_is_not_compared():
+    """Of labels that are given again it has those of evaluations, unless it keeps all."""
+    settings = SETTINGS.changed({'evaluate_every': 200})  # after phase 1, 3, 5
+    given = [[(0, 0, [1.0, 2.0])]] * 6
+    moving = [labels(p, *s, version=p) for p, s in enumerate(given)]
+    between = [labels(p, *s, version=(p + 1) // 3) for p, s in enumerate(given)]
+    true = true_rewards(0, 0, 1.0, 2.0)
+
+    def steps(records, **changes) -> list[float]:
+        chosen = settings.changed(changes)
+        return [r['step'] for r in observe(true, *records, settings=chosen, recorded=True)]
+
+    assert steps(moving) == [200, 400, 600]
+    assert steps(between) == [200, 600], 'relabelled after phase 2, when nothing is evaluated'
+    assert steps(between, record_relabels='all') == [200, 400, 600]
+    assert steps(moving, relabel_steps=2) == []
+    still = [labels(p, *s, version=0) for p, s in enumerate(given)]
+    assert steps(still, relabel_steps=2) == [200, 400, 600], 'nothing is labelled again'
+
+
+@pytest.mark.parametrize(
+    ('records', 'said'),
+    [
+        ([], "'sim' told no true rewards"),
+        ([true_rewards(0, 0, 1.0), true_rewards(0, 2, 1.0)], 'before episode 0, step 2'),
+        ([true_rewards(0, 0, 1.0), true_rewards(2, 0, 1.0)], 'before episode 2, step 0'),
+        ([true_rewards(0, 5, 1.0)], 'before episode 0, step 5'),
+    ],
+)
+def test_true_rewards_that_are_missing_are_named(records, said):
+    with pytest.raises(RecoveryError, match=said):
+        observe(*records, labels(0, (0, 0, [1.0])))
+
+
+def test_labels_beyond_the_true_rewards_are_refused():
+    for beyond in (3, 0, [1.0]), (0, 1, [1.0, 1.0]):
+        with pytest.raises(RecoveryError, match='up to episode 0, 2 steps'):
+            observe(true_rewards(0, 0, 1.0, 2.0), labels(0, beyond))
 
 
 def test_many_episodes_are_kept_apart():

@@ -516,6 +516,11 @@ class Settings(Group):
         """Environment steps that policy version `version` has learnt from."""
         return min(self.steps, (version + 1) * self.phase_steps)
 
+    @property
+    def relabels_all(self) -> bool:
+        """Whether each version of the reward model labels all of the memory."""
+        return self.relabel == 'all' and not self.relabel_steps
+
     def evaluated(self, version: int) -> bool:
         """Whether this policy version is evaluated: the last one, and the first past each
         multiple.

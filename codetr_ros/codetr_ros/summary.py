@@ -90,13 +90,18 @@ class Summary:
         self._training: dict[int, _Results] = {}  # by phase
         self._metrics: dict[int, dict[tuple[str, str, str], float]] = defaultdict(dict)  # by phase
         self._phases = 0
-        # elsewhere true rewards and labels do not meet
-        self._recovery = Recovery(settings) if in_process else None
+        self._recovery = Recovery(settings, recorded=not in_process)
+        self._wall: float | None = None  # seconds that the run took, once it is over
 
     def receive(self, record: Record) -> None:
-        """Take note of a record of the run, of whatever kind; once more changes nothing."""
-        if self._recovery is not None:
-            self._recovery.receive(record)
+        """Take note of a record of the run, of whatever kind.
+
+        Episodes, metrics and commits may come more than once, true rewards and labels must not.
+
+        Raises:
+            RecoveryError: labels come whose steps' true rewards have not all come before.
+        """
+        self._recovery.receive(record)
         if isinstance(record, EpisodeResult):
             if record.purpose == 'training':
                 # the last phase that a step belongs to: step 1000 of 1000-step phases ends phase 0
@@ -126,8 +131,12 @@ class Summary:
 
     @property
     def wall_s(self) -> float:
-        """Seconds since the run began, the start of its processes included."""
-        return self._clock() - self._began
+        """Seconds that the run has taken, the start of its processes included."""
+        return self._clock() - self._began if self._wall is None else self._wall
+
+    def end(self) -> None:
+        """The run is over: what is learnt about it from now on takes none of its time."""
+        self._wall = self.wall_s
 
     def evaluations(self) -> list[dict[str, Any]]:
         """One row for each evaluation, in order of training steps."""
@@ -178,7 +187,7 @@ class Summary:
             'steps_per_s': round(self.steps / wall, 3) if wall > 0 else None,
             'evaluations': evaluations,
             'random': random,
-            'reward_recovery': self._recovery.rows if self._recovery else [],
+            'reward_recovery': self._recovery.rows,
             'random_score': random['score_mean'] if random else None,
             'final_score': last['score_mean'] if last else None,
             'random_true_return': random['true_return_mean'] if random else None,

@@ -21,7 +21,15 @@ from codetr_ros.cli.supervise import Interrupts, Silence, supervise, why_it_gave
 from codetr_ros.config import Settings, SettingsError
 from codetr_ros.launcher import LaunchError
 from codetr_ros.progress import Progress
-from codetr_ros.records import Commit, EpisodeResult, Metrics, Record
+from codetr_ros.records import (
+    Commit,
+    EpisodeResult,
+    Metrics,
+    Record,
+    StepRewards,
+    TrueRewards,
+)
+from codetr_ros.recovery import RecoveryError
 from codetr_ros.run_folder import RunFolderError
 from codetr_ros.summary import Summary
 from codetr_ros.summary import write as write_summary
@@ -233,14 +241,15 @@ def _over_topics(
         key = run_folder.report_path(folder, node.role, node.name).stem
         reports.setdefault(key, {'role': node.role, 'name': node.name})
         reports[key]['exit_code'] = node.code
+    summary.end()
     _complete(summary, folder, progress)
     culprit = next((node.log for node in processes.nodes if node.unasked_failure), None)
     return Outcome(reports, bool(interrupts.count), failure, culprit)
 
 
 def _complete(summary: Summary, folder: Path, progress: Progress) -> None:
-    """Tell the summary what the bag holds: who listens to a run may come too late for its first
-    messages, the recorder is waited for.
+    """Tell the summary what the bag holds: all that was said, where who listens to a run may come
+    too late for its first messages, and true rewards and labels, which nobody listens to.
     """
     from codetr_ros.bags.errors import BagError
     from codetr_ros.bags.reader import Bag
@@ -248,10 +257,15 @@ def _complete(summary: Summary, folder: Path, progress: Progress) -> None:
     if not (folder / run_folder.BAG).exists():
         return  # no recorder came up, which the failure says
     try:
-        for entry in Bag(folder / run_folder.BAG).entries((EpisodeResult, Metrics, Commit)):
-            summary.receive(entry.record)
+        bag = Bag(folder / run_folder.BAG)
+        # labels last: they may have been noted before true rewards of their phase
+        for kinds in (EpisodeResult, Metrics, Commit, TrueRewards), (StepRewards,):
+            for entry in bag.entries(kinds):
+                summary.receive(entry.record)
     except BagError as error:
         progress.say(f'the summary holds what was heard, and of the bag what came before: {error}')
+    except RecoveryError as error:
+        progress.say(f'reward recovery cannot be told to the end: {error}')
 
 
 def _short(path: Path) -> str:
