@@ -252,11 +252,39 @@ def test_the_report_is_one_file_that_holds_picture_tables_and_settings(tmp_path:
 
 
 @pytest.mark.parametrize(
+    ('rows', 'shown'),
+    [
+        ([], 'no labels were compared'),
+        ([(4000, 0.125, 0.5)], 'correlation 0.12, within segments 0.50'),
+        ([(4000, 0.125, None)], 'correlation 0.12'),
+        ([(2000, 0.125, None)], 'correlation 0.12, after 2000 steps'),
+        ([(2000, 0.9, 0.9), (4000, None, None)], 'not defined where one side does not vary'),
+    ],
+)
+def test_the_report_tells_the_last_reward_recovery(rows, shown):
+    names = 'step', 'pearson', 'within'
+    said = built() | {
+        'evaluations': [{'step': 4000, 'true_return_std': 1.0}],
+        'reward_recovery': [dict(zip(names, row, strict=True)) for row in rows],
+    }
+    assert dict(report.result_rows(said))['reward recovery'] == shown
+
+
+@pytest.mark.parametrize(
     ('encoding', 'shown'), [('utf-8', '▁▄█▁'), ('ascii', '.=@.'), (None, '.=@.')]
 )
 def test_the_sketch_of_a_curve_fits_the_terminal(encoding: str | None, shown: str) -> None:
     assert report.sketch([0, 50, 110, 0], encoding) == shown
     assert report.sketch([3.0, 3.0], 'utf-8') == '▁▁'
+
+
+def test_what_is_learnt_about_a_run_that_has_ended_takes_none_of_its_time():
+    clock = Clock()
+    made = Summary(SETTINGS, 'r', in_process=False, clock=clock)
+    clock.now += 50
+    made.end()
+    clock.now += 7
+    assert made.build({})['wall_s'] == 50
 
 
 def test_a_summary_on_disk_is_what_was_built(tmp_path: Path) -> None:

@@ -126,7 +126,7 @@ def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ('score of the random policy', number(summary['random_score'], '.3f')),
         ('true return', f'{number(summary["final_true_return"], ".1f")}{spread}'),
         ('true return of the random policy', number(summary['random_true_return'], '.1f')),
-        ('reward recovery', _recovery(summary['reward_recovery'])),
+        ('reward recovery', _recovery(summary)),
         ('steps', f'{summary["steps"]} of {summary["steps_planned"]}'),
         ('phases', f'{summary["phases"]} of {summary["phases_planned"]}'),
         ('time', f'{summary["wall_s"]:.1f} s, {summary["steps_per_s"] or 0:.0f} steps per second'),
@@ -140,19 +140,18 @@ def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _recovery(rows: Sequence[Mapping[str, Any]]) -> str:
-    """How well the step rewards of the last evaluation agree with the true ones."""
+def _recovery(summary: Mapping[str, Any]) -> str:
+    """How well step rewards agreed with the true ones when they were last compared."""
+    rows, evaluations = summary['reward_recovery'], summary['evaluations']
+    if not rows:
+        return 'no labels were compared'
     said = {'pearson': 'correlation', 'within': 'within segments'}
-    numbers = [
-        f'{name} {rows[-1][key]:.2f}'
-        for key, name in said.items()
-        if rows and rows[-1][key] is not None
+    found = [
+        f'{name} {rows[-1][key]:.2f}' for key, name in said.items() if rows[-1][key] is not None
     ]
-    return (
-        f'{", ".join(numbers)} after {rows[-1]["step"]} steps'
-        if numbers
-        else 'no labels were compared'
-    )
+    late = bool(evaluations) and evaluations[-1]['step'] != rows[-1]['step']
+    after = f', after {rows[-1]["step"]} steps' if late else ''
+    return (', '.join(found) or 'not defined where one side does not vary') + after
 
 
 _BARS = ' ▁▂▃▄▅▆▇█'
