@@ -242,25 +242,32 @@ def _over_topics(
         reports.setdefault(key, {'role': node.role, 'name': node.name})
         reports[key]['exit_code'] = node.code
     summary.end()
-    _complete(summary, folder, progress)
+    interrupted = bool(interrupts.count)
+    _complete(summary, folder, progress, interrupts)
     culprit = next((node.log for node in processes.nodes if node.unasked_failure), None)
-    return Outcome(reports, bool(interrupts.count), failure, culprit)
+    return Outcome(reports, interrupted, failure, culprit)
 
 
-def _complete(summary: Summary, folder: Path, progress: Progress) -> None:
+def _complete(summary: Summary, folder: Path, progress: Progress, interrupts: Interrupts) -> None:
     """Tell the summary what the bag holds: all that was said, where who listens to a run may come
-    too late for its first messages, and true rewards and labels, which nobody listens to.
+    too late for its first messages, and true rewards and labels, which nobody listens to. Takes a
+    second for each evaluation of a memory of a million steps; Ctrl-C ends it.
     """
     from codetr_ros.bags.errors import BagError
     from codetr_ros.bags.reader import Bag
 
     if not (folder / run_folder.BAG).exists():
         return  # no recorder came up, which the failure says
+    asked = interrupts.count
+    progress.say('reading the bag for the summary')
     try:
         bag = Bag(folder / run_folder.BAG)
         # labels last: they may have been noted before true rewards of their phase
         for kinds in (EpisodeResult, Metrics, Commit, TrueRewards), (StepRewards,):
             for entry in bag.entries(kinds):
+                if interrupts.count > asked:
+                    progress.say('stopped: the summary holds what was read until now')
+                    return
                 summary.receive(entry.record)
     except BagError as error:
         progress.say(f'the summary holds what was heard, and of the bag what came before: {error}')
