@@ -1,3 +1,5 @@
+import weakref
+
 import numpy as np
 import pytest
 from builders import step_rewards, tiny
@@ -122,6 +124,16 @@ def test_true_rewards_may_come_before_the_labels_of_earlier_phases():
     in_turn = observe(first, said[0], second, said[1], settings=settings)
     assert in_turn == observe(first, second, *said, settings=settings)
     assert [row['steps'] for row in in_turn] == [2, 2]
+
+
+def test_chunks_of_a_run_without_labels_are_not_kept():
+    recovery, kept = Recovery(SETTINGS), []
+    for phase in range(20):
+        chunk = true_rewards(phase, 0, 1.0, phase=phase)
+        kept.append(weakref.ref(chunk.rewards))
+        recovery.receive(chunk)
+        del chunk
+    assert sum(array() is not None for array in kept) == SETTINGS.lag
 
 
 def test_what_a_bag_lacks_labels_of_is_not_compared():

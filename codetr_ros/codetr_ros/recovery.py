@@ -96,7 +96,8 @@ class Recovery:
     What is compared is what the policy learns from: labels of the newest `memory_steps` steps up
     to the phase of the labels; where all of the memory is labelled again in each phase, those of
     the newest version only, as others belong to steps that have left it. They take 20 bytes each.
-    True rewards may come in advance by any number of phases.
+    True rewards may come before labels of earlier phases: as many phases as the run's simulators
+    may be ahead of its learner, or any number where they are recorded.
 
     Args:
         settings: the run's settings.
@@ -106,7 +107,7 @@ class Recovery:
 
     def __init__(self, settings: Settings, recorded: bool = False) -> None:
         self._settings = settings
-        self._keeps_all = not recorded or settings.record_relabels == 'all'
+        self._recorded = recorded
         self._complete = True  # no label is lacking
         self._version: int | None = None  # of the last labels
         self._sources: dict[str, _Source] = {}
@@ -123,6 +124,9 @@ class Recovery:
             RecoveryError: there are labels, but not all of the true rewards.
         """
         if isinstance(record, TrueRewards):
+            if not self._recorded:
+                # those are labelled, if ever: of a run without labels none may wait for good
+                self._take_in(record.phase - self._settings.lag)
             self._coming.append(record)
         elif isinstance(record, StepRewards):
             self._take_in(record.phase)
@@ -140,7 +144,7 @@ class Recovery:
         """
         if record.version != self._version and self._version is not None:
             whole = self._settings.evaluated(record.phase) and self._settings.relabels_all
-            self._complete = self._keeps_all or whole
+            self._complete = whole or not self._recorded or self._settings.record_relabels == 'all'
         self._version = record.version
 
     def _take_in(self, phase: int) -> None:
