@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 from bags.making import ours
+from builders import step_rewards
 
 from codetr_ros import config, report, run_folder, summary
 from codetr_ros.cli import train
+from codetr_ros.cli.supervise import Interrupts
 from codetr_ros.config import Settings
 from codetr_ros.progress import Progress, duration
 from codetr_ros.records import Commit, EpisodeResult, Presence, Record, metrics
@@ -403,12 +405,39 @@ def test_what_was_not_heard_is_taken_from_the_bag(tmp_path):
     for record in a_run()[3:]:
         late.receive(record)
     assert late.build({})['random'] is None
-    train._complete(late, tmp_path, progress)
+    train._complete(late, tmp_path, progress, Interrupts())
     assert told(late) == told(heard)
-    assert not stream.getvalue()
+    assert stream.getvalue().splitlines() == ['reading the bag for the summary']
 
     file = next(bag.glob('*.mcap'))
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    train._complete(late, tmp_path, progress)
+    train._complete(late, tmp_path, progress, Interrupts())
     assert told(late) == told(heard)
     assert 'what was heard' in stream.getvalue()
+
+
+def test_ctrl_c_ends_the_reading_of_the_bag_and_the_summary_is_written_all_the_same(tmp_path):
+    ours(tmp_path / run_folder.BAG, a_run())
+    interrupts = Interrupts()
+
+    class Impatient(io.StringIO):
+        """Of somebody who interrupts whatever is said."""
+
+        def write(self, text: str) -> int:
+            interrupts.count += 1
+            return super().write(text)
+
+    stream, late = Impatient(), Summary(SETTINGS, 'r', False, Clock())
+    progress = Progress(SETTINGS, stream, live=False, clock=Clock())
+    train._complete(late, tmp_path, progress, interrupts)
+    assert 'stopped: the summary holds what was read until now' in stream.getvalue()
+    assert late.build({})['evaluations'] == []
+
+
+def test_reward_recovery_without_all_true_rewards_is_said_not_to_be_told(tmp_path):
+    ours(tmp_path / run_folder.BAG, [*a_run(), step_rewards(phase=0, source='sim')])
+    stream, late = io.StringIO(), Summary(SETTINGS, 'r', False, Clock())
+    progress = Progress(SETTINGS, stream, live=False, clock=Clock())
+    train._complete(late, tmp_path, progress, Interrupts())
+    assert "cannot be told to the end: 'sim' told no true rewards" in stream.getvalue()
+    assert late.build({})['evaluations'], 'all else is told'
