@@ -10,8 +10,8 @@ import time
 from pathlib import Path
 
 import machine
-from codetr_ros import launcher
 from codetr_ros.config import Settings
+from codetr_ros.processes import launcher
 
 BEGUN, LEARNT = 'phase 0 is played', 'everything is played and learnt from'
 """What the player says at the first commit, and when its last phase has been handled."""

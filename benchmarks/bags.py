@@ -54,7 +54,7 @@ from codetr_ros.bags.topics import BagTopic
 from codetr_ros.bags.verify import verify
 from codetr_ros.bags.writer import McapWriter
 from codetr_ros.config import Settings, load
-from codetr_ros.received import type_name
+from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import (
     PROTOCOL_VERSION,
     TOPICS,
@@ -66,7 +66,7 @@ from codetr_ros.records import (
     Transitions,
     TrueRewards,
 )
-from codetr_ros.trajectories import Trajectories
+from codetr_ros.records.fields import type_name
 
 PHASE, CHUNK, DELAY, ACTIONS = 1000, 500, 25, 8
 RESULTS = Path(__file__).parent / 'results' / 'bags'

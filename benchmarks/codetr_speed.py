@@ -40,11 +40,11 @@ import torch
 
 import machine
 from codetr_ros.config import Settings, load
+from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import CompositeReward, Transitions
 from codetr_ros.rewards.codetr import Codetr
-from codetr_ros.rewards.cost import Cost
 from codetr_ros.seeding import generator, seed_torch
-from codetr_ros.trajectories import Trajectories
+from cost import Cost
 
 RESULTS = Path(__file__).parent / 'results'
 OBSERVATION, ACTION = 27, 8  # Ant

@@ -54,9 +54,9 @@ def work(role: str, observation: int, steps: int) -> dict[str, Any]:
 
     from codetr_ros.config import load
     from codetr_ros.learners.flat_sac import FlatSAC
+    from codetr_ros.memory.trajectories import Trajectories
     from codetr_ros.records import CompositeReward, StepRewards, Transitions
     from codetr_ros.rewards.codetr import Codetr
-    from codetr_ros.trajectories import Trajectories
 
     torch.set_num_threads(1)
     settings = load('paper').changed({'sac.compile': False})

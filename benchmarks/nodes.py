@@ -33,9 +33,10 @@ import numpy as np
 
 import machine
 import throughput
-from codetr_ros import launcher, run_folder
 from codetr_ros.config import Settings, load
+from codetr_ros.processes import launcher
 from codetr_ros.records import Commit, CompositeReward, Record, Transitions
+from codetr_ros.runs import folder as run_folder
 
 RESULTS = Path(__file__).parent / 'results'
 PARTS = ('idle', 'crossing', 'runs')
@@ -110,7 +111,7 @@ def idle(settings: Settings, seconds: float) -> Iterator[Row]:
 
 def a_phase(phase: int) -> list[Record]:
     """1000 steps of Ant and their scores, in chunks as the simulator makes them."""
-    from codetr_ros.source import chunk_steps
+    from codetr_ros.simulation.source import chunk_steps
 
     rng = np.random.default_rng(phase)
     most, records = chunk_steps(OBSERVATIONS, ACTIONS), list[Record]()

@@ -31,10 +31,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import machine
-from codetr_ros import launcher, run_folder
 from codetr_ros.config import Settings, load
+from codetr_ros.processes import launcher
 from codetr_ros.records import Commit, Metrics, Record
 from codetr_ros.ros.watch import Watcher
+from codetr_ros.runs import folder as run_folder
 
 RESULTS = Path(__file__).parent / 'results' / 'recording_overhead.md'
 DEADLINE = 1800.0  # [s] for one run

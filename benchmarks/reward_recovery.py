@@ -29,16 +29,17 @@ import numpy as np
 import torch
 
 import machine
-from codetr_ros import in_process, rewards
-from codetr_ros.composite import composite
 from codetr_ros.config import Settings, load
+from codetr_ros.cores import in_process
+from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import CompositeReward, Record, Transitions, TrueRewards
-from codetr_ros.recovery_metrics import r_squared, step_recovery
+from codetr_ros.rewards import registry
+from codetr_ros.rewards.base import segment_steps
 from codetr_ros.rewards.codetr import Codetr
 from codetr_ros.rewards.learned import Learned
-from codetr_ros.rewards.method import segment_steps
+from codetr_ros.runs.recovery_metrics import r_squared, step_recovery
 from codetr_ros.seeding import generator, seed_torch
-from codetr_ros.trajectories import Trajectories
+from codetr_ros.simulation.composite import composite
 
 DELAY = 25
 COMPOSITES = ('sum', 'sum_square', 'square_sum', 'max')
@@ -156,7 +157,7 @@ def measure(
 ) -> dict[str, float]:
     """Fit on the training episodes, compare on the held-out ones."""
     train, held_out = memories(data, settings)
-    method = rewards.make(settings, train.observation_size, train.action_size)
+    method = registry.make(settings, train.observation_size, train.action_size)
     method.prepare(train)
     for i in range(gradient_steps):
         seed_torch(settings.seed, 'recovery', i)

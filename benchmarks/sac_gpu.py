@@ -37,8 +37,8 @@ from torch.profiler import ProfilerActivity, profile
 import machine
 from codetr_ros.config import SacSettings
 from codetr_ros.learners.device_sac import DeviceSAC
+from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import StepRewards, Transitions
-from codetr_ros.trajectories import Trajectories
 
 RESULTS = Path(__file__).parent / 'results' / 'sac_gpu'
 SIZES = {'Ant 27': (27, 8), 'Ant 105': (105, 8), 'HalfCheetah': (17, 6)}

@@ -99,8 +99,8 @@ def ours(form: str, size: Size) -> Callable[[int], None]:
     from codetr_ros.config import SacSettings
     from codetr_ros.learners.flat_sac import FlatSAC
     from codetr_ros.learners.sac import SAC
+    from codetr_ros.memory.trajectories import Trajectories
     from codetr_ros.records import StepRewards, Transitions
-    from codetr_ros.trajectories import Trajectories
 
     torch.set_num_threads(size.threads)
     memory = Trajectories(size.observation, size.action, EPISODE, STEPS, EPISODE)

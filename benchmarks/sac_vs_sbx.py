@@ -112,9 +112,10 @@ def run_ours(
     seed: int, lecun: bool = False, steps: int = STEPS, warmup: int = WARMUP
 ) -> dict[str, Any]:
     """One in-process run of ours, with its own initial weights or with flax's."""
-    from codetr_ros import config, in_process
+    from codetr_ros import config
+    from codetr_ros.cores import in_process
     from codetr_ros.learners import from_labels
-    from codetr_ros.summary import Summary
+    from codetr_ros.runs.summary import Summary
 
     if lecun:
         from_labels.FlatSAC = _with_lecun_weights(from_labels.FlatSAC)
@@ -151,7 +152,7 @@ def _with_lecun_weights(sac: type) -> type:
     """
     import torch
 
-    from codetr_ros.learners.network import linear_layers
+    from codetr_ros.policy.actor import linear_layers
 
     def draw(weight: Any, inputs: int) -> None:
         std = inputs**-0.5 / 0.87962566103423978  # what the cut takes off the deviation

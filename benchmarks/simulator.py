@@ -47,19 +47,15 @@ import numpy as np
 import torch
 
 import machine
-from codetr_ros import processors, tasks
 from codetr_ros.config import Settings
-from codetr_ros.learners.network import (
-    ActingPolicy,
-    Actor,
-    describe,
-    linear_layers,
-    weights_bytes,
-)
+from codetr_ros.cores.simulator import Simulator
+from codetr_ros.policy.acting import ActingPolicy, uniform_actions
+from codetr_ros.policy.actor import Actor, describe, linear_layers, weights_bytes
 from codetr_ros.records import F32, INITIAL_VERSION, Policy
-from codetr_ros.rollout import Episode, uniform_actions
 from codetr_ros.seeding import generator
-from codetr_ros.simulator import Simulator
+from codetr_ros.simulation import tasks
+from codetr_ros.simulation.episode import Episode
+from codetr_ros.system import processors
 
 RESULTS = Path(__file__).parent / 'results'
 PACKAGES = ('mujoco', 'gymnasium', 'numpy', 'torch')

@@ -53,13 +53,14 @@ import numpy as np
 import torch
 
 import machine
-from codetr_ros import rewards, tasks
 from codetr_ros.config import Settings, load
 from codetr_ros.learners.flat_sac import FlatSAC
+from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import CompositeReward, StepRewards, Transitions
-from codetr_ros.rewards.method import segment_steps
+from codetr_ros.rewards import registry
+from codetr_ros.rewards.base import segment_steps
 from codetr_ros.seeding import generator, seed_torch
-from codetr_ros.trajectories import Trajectories
+from codetr_ros.simulation import tasks
 
 RESULTS = Path(__file__).parent / 'results'
 PACKAGES = ('torch', 'numpy', 'mujoco', 'gymnasium')
@@ -98,7 +99,7 @@ class Parts:
         self.sac = FlatSAC(*sizes, settings.sac, settings.seed)
         self.large = settings.changed({'sac.hidden': (256, 256), 'sac.batch': 256})
         self.large_sac = FlatSAC(*sizes, self.large.sac, settings.seed)
-        self.method = rewards.make(settings, *sizes)
+        self.method = registry.make(settings, *sizes)
         self.method.prepare(self.memory)
         self.rng = generator(settings.seed, 'throughput')
         self.episode = 0

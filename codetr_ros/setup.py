@@ -12,7 +12,7 @@ setup(
     maintainer_email='maintainers@codetr-ros.example',
     license='Apache-2.0',
     packages=find_packages(exclude=['test']),
-    package_data={'codetr_ros.presets': ['*.yaml'], 'codetr_ros.bags': ['msg/*.msg']},
+    package_data={'codetr_ros.config.presets': ['*.yaml'], 'codetr_ros.bags': ['msg/*.msg']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),
         (f'share/{package_name}', ['package.xml']),

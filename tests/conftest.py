@@ -12,13 +12,11 @@ os.environ['OMP_NUM_THREADS'] = '1'
 import pytest
 
 ROS = importlib.util.find_spec('rclpy') is not None
-collect_ignore_glob = [] if ROS else ['ros/*', 'system/*']
+collect_ignore_glob = [] if ROS else ['ros/*', 'graph/*']
 
 
 def pytest_report_header() -> str:
-    return (
-        'ROS: found' if ROS else 'ROS: rclpy is missing, tests/ros and tests/system are left out'
-    )
+    return 'ROS: found' if ROS else 'ROS: rclpy is missing, tests/ros and tests/graph are left out'
 
 
 @pytest.fixture
@@ -33,5 +31,5 @@ def ros_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
 
 @pytest.fixture(autouse=True)
 def _own_ros_domain(request: pytest.FixtureRequest) -> None:
-    if {'ros', 'system'} & set(request.path.parent.parts):
+    if {'ros', 'graph'} & set(request.path.parent.parts):
         request.getfixturevalue('ros_domain')

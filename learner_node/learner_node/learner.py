@@ -13,7 +13,7 @@ def load() -> 'MakeCore':
     """Import the core and return what makes it."""
     import torch._dynamo  # noqa: F401 - the first optimiser imports it: seconds, amid the run
 
-    from codetr_ros.learners.core import Learner
+    from codetr_ros.cores.learner import Learner
 
     return Learner
 

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 def load() -> 'MakeCore':
     """Import the core and return what makes it."""
-    from codetr_ros.evaluation import Evaluator
+    from codetr_ros.cores.evaluator import Evaluator
 
     return lambda run, settings, name, folder: Evaluator(run, settings, name)
 

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 def load() -> 'MakeCore':
     """Import the core and return what makes it."""
-    from codetr_ros.simulator import Simulator
+    from codetr_ros.cores.simulator import Simulator
 
     return lambda run, settings, name, folder: Simulator(run, settings, name)
 

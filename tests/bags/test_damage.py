@@ -12,12 +12,12 @@ import os
 from pathlib import Path
 
 import pytest
-from bags.damage import CHECKED, KINDS, MEMORY, ORDERLY, RUN, Tally, run_cases, table
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from codetr_ros.bags.definitions import decode, encode
 from codetr_ros.records import TOPICS, RecordError
+from helpers.damage import CHECKED, KINDS, MEMORY, ORDERLY, RUN, Tally, run_cases, table
 
 CASES = int(os.environ.get('CODETR_DAMAGE_CASES', '5'))
 TALLIES: dict[tuple[str, str], Tally] = {}

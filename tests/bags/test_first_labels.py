@@ -5,9 +5,9 @@ from collections import deque
 
 import numpy as np
 import pytest
-from builders import step_rewards, tiny
 
 from codetr_ros.bags.first_labels import FirstLabels
+from helpers.builders import step_rewards, tiny
 
 DELAY, EPISODE, MEMORY = 5, 20, 1000  # steps
 NEVER = {'evaluate_every': 0, 'memory_steps': MEMORY}

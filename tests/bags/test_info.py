@@ -3,11 +3,11 @@ import math
 from dataclasses import replace
 
 import pytest
-from bags.making import WRITERS, a_run, ours
 
 from codetr_ros.bags.info import Range, survey
 from codetr_ros.cli import main
 from codetr_ros.records import CompositeReward, RunSpec
+from helpers.bags import WRITERS, a_run, ours
 
 
 @pytest.mark.parametrize('writer', ['ours', 'rosbags-sqlite-9', 'mcap-lz4'])

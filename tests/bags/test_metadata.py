@@ -6,11 +6,11 @@ What it asks for, field by field and with its types, is in its sources: `yaml.hp
 
 import pytest
 import yaml
-from bags.making import WRITERS, a_run, ours
 from mcap.reader import make_reader
 
 from codetr_ros.bags.metadata import read
 from codetr_ros.bags.recover import recover
+from helpers.bags import WRITERS, a_run, ours
 
 POLICIES = {
     'history': ('system_default', 'keep_last', 'keep_all', 'unknown'),

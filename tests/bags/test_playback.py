@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bags.making import SETTINGS, WRITERS, a_run, ours
-from builders import run, same
 
 from codetr_ros.bags import causal as causal_module
 from codetr_ros.bags.causal import causal
@@ -23,6 +21,8 @@ from codetr_ros.records import (
     TrueRewards,
     metrics,
 )
+from helpers.bags import SETTINGS, WRITERS, a_run, ours
+from helpers.builders import run, same
 
 
 def played(records=None):

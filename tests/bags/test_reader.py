@@ -8,9 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bags.making import WRITERS, a_run, ours, topic_of
-from builders import same
-from disks import fill, small_disk
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -19,9 +16,12 @@ from codetr_ros.bags.errors import BagError
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.topics import BagTopic
 from codetr_ros.bags.writer import McapWriter
-from codetr_ros.received import type_name
+from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import TOPICS, Commit, RunSpec, Transitions
-from codetr_ros.trajectories import Trajectories
+from codetr_ros.records.fields import type_name
+from helpers.bags import WRITERS, a_run, ours, topic_of
+from helpers.builders import same
+from helpers.disks import fill, small_disk
 
 
 def read(path, kinds=None):

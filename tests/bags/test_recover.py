@@ -10,8 +10,6 @@ import textwrap
 from pathlib import Path
 
 import pytest
-from bags.damage import killed
-from bags.making import WRITERS, a_run, by_mcap, ours
 from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
@@ -23,8 +21,10 @@ from codetr_ros.bags.recover import recover
 from codetr_ros.bags.topics import schema_text
 from codetr_ros.bags.verify import verify
 from codetr_ros.cli import main
-from codetr_ros.received import type_name
 from codetr_ros.records import Commit, RunSpec, Transitions, TrueRewards
+from codetr_ros.records.fields import type_name
+from helpers.bags import WRITERS, a_run, by_mcap, ours
+from helpers.damage import killed
 
 RUN = a_run()
 

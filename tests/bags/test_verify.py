@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bags.making import WRITERS, a_run, ours
 
 from codetr_ros.bags.episodes import SourceChecks
 from codetr_ros.bags.findings import Findings
@@ -25,6 +24,7 @@ from codetr_ros.records import (
     Transitions,
     TrueRewards,
 )
+from helpers.bags import WRITERS, a_run, ours
 
 
 def named(path, kind=None):
@@ -214,8 +214,8 @@ def test_two_runs_in_namespaces_of_their_own_are_not_mixed(tmp_path):
     from codetr_ros.bags.definitions import encode
     from codetr_ros.bags.topics import BagTopic
     from codetr_ros.bags.writer import McapWriter
-    from codetr_ros.received import type_name
     from codetr_ros.records import TOPICS
+    from codetr_ros.records.fields import type_name
 
     topics = [
         BagTopic(f'/{n}/{t}', type_name(k), 9, False) for n in 'ab' for k, t in TOPICS.items()

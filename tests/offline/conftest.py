@@ -3,12 +3,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from builders import tiny
-from offline.bag_making import write
 
-from codetr_ros import in_process
 from codetr_ros.config import Settings
+from codetr_ros.cores import in_process
 from codetr_ros.records import Record
+from helpers.builders import tiny
+from helpers.foreign_bags import write
 
 
 @dataclass

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import run, score, task_spec, tiny, transitions
-from offline.bag_making import write
 
 from codetr_ros.bags.reader import Bag
 from codetr_ros.offline import episodes
 from codetr_ros.offline.episodes import Index, stretches
 from codetr_ros.offline.errors import FitError
+from helpers.builders import run, score, task_spec, tiny, transitions
+from helpers.foreign_bags import write
 
 
 def index(tmp_path, *bags, run_id=None):

@@ -7,12 +7,15 @@ import sys
 from dataclasses import replace
 
 import pytest
-from builders import run, score, transitions
-from offline.bag_making import write
 from rosbags.rosbag2 import StoragePlugin
 
-from codetr_ros import checkpoints, cli, config, rewards
+from codetr_ros import cli, config
 from codetr_ros.records import CompositeReward, RunSpec, TaskSpec, Transitions
+from codetr_ros.rewards import registry
+from codetr_ros.rewards.learned import Learned
+from codetr_ros.runs import checkpoints
+from helpers.builders import run, score, transitions
+from helpers.foreign_bags import write
 
 QUICKLY = ['--gradient-steps', '30', '--check-every', '10']
 WITHOUT_ROS = """
@@ -67,17 +70,19 @@ def test_a_bag_becomes_a_checkpoint_a_summary_and_a_report_without_ros(a_run, tm
 
     tensors, meta = checkpoints.load(checkpoints.latest(out / 'checkpoints', 'reward'))
     settings = config.from_canonical(meta['settings'], 'checkpoint')
-    method = rewards.make(settings, meta['observation_size'], meta['action_size'])
+    method = registry.make(settings, meta['observation_size'], meta['action_size'])
     method.load_state(tensors)
     assert checkpoints.digest(method.state()) == said['reward_model_sha256']
     assert settings == config.load(str(out / 'config.yaml'))
 
 
-@pytest.mark.parametrize('method', [m for m in rewards.METHODS if m not in config.IN_PROCESS_ONLY])
+@pytest.mark.parametrize(
+    'method', [m for m in registry.METHODS if m not in config.IN_PROCESS_ONLY]
+)
 def test_every_method_that_a_node_can_run_can_be_fitted(a_run, tmp_path, method):
     said = quickly(a_run.bag, tmp_path / 'out', f'--method={method}')
 
-    learns = issubclass(rewards.METHODS[method], rewards.learned.Learned)
+    learns = issubclass(registry.METHODS[method], Learned)
     assert (said['metrics']['composite_r2'] is not None) == learns
     assert (said['best'] is not None) == learns
     assert len(said['reward_model_sha256']) == 64

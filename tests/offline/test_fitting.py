@@ -5,10 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import score, tiny, transitions
-from offline.bag_making import write
 
-from codetr_ros import checkpoints
 from codetr_ros.bags.reader import Bag
 from codetr_ros.offline import fitting
 from codetr_ros.offline.episodes import Index, stretches
@@ -16,6 +13,9 @@ from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.loading import load, newest
 from codetr_ros.offline.settings import FitSettings
 from codetr_ros.records import CompositeReward, TrueRewards
+from codetr_ros.runs import checkpoints
+from helpers.builders import score, tiny, transitions
+from helpers.foreign_bags import write
 
 SIZES = 3, 2
 DELAY = 7

@@ -3,25 +3,19 @@
 import numpy as np
 import pytest
 import torch
-from builders import score, transitions
-from offline.bag_making import message, write, write_messages
-from test_saved_models import trained
 
-from codetr_ros import checkpoints, cli
+from codetr_ros import cli
 from codetr_ros.bags.definitions import encode
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.topics import BagTopic
 from codetr_ros.bags.verify import verify
 from codetr_ros.bags.writer import McapWriter
-from codetr_ros.received import type_name
-from codetr_ros.records import (
-    TOPICS,
-    CompositeReward,
-    RunSpec,
-    StepRewards,
-    TaskSpec,
-    Transitions,
-)
+from codetr_ros.records import TOPICS, CompositeReward, RunSpec, StepRewards, TaskSpec, Transitions
+from codetr_ros.records.fields import type_name
+from codetr_ros.runs import checkpoints
+from helpers.builders import score, transitions
+from helpers.foreign_bags import message, write, write_messages
+from helpers.saved import trained
 
 
 @pytest.fixture(scope='module')

@@ -5,19 +5,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from builders import tiny
-from offline.bag_making import write
 
-from codetr_ros import checkpoints, cli, in_process
+from codetr_ros import cli
 from codetr_ros.bags.verify import verify
-from codetr_ros.records import (
-    Commit,
-    CompositeReward,
-    Record,
-    RunSpec,
-    StepRewards,
-    Transitions,
-)
+from codetr_ros.cores import in_process
+from codetr_ros.records import Commit, CompositeReward, Record, RunSpec, StepRewards, Transitions
+from codetr_ros.runs import checkpoints
+from helpers.builders import tiny
+from helpers.foreign_bags import write
 
 DIGEST = 'reward_model_sha256'
 

@@ -1,8 +1,9 @@
 import pytest
 import rclpy
-from builders import tiny
 from rclpy.signals import SignalHandlerOptions
-from ros.playing import NAMESPACE, Play
+
+from helpers.builders import tiny
+from helpers.playing import NAMESPACE, Play
 
 
 @pytest.fixture

@@ -6,13 +6,12 @@ import resource
 import shutil
 
 import pytest
-from disks import fill, small_disk
 from mcap.reader import make_reader
-from ros.test_bag_splits import files
-from ros.test_bag_writer import TRANSITIONS, raw, sequences
 
 from codetr_ros.bags.errors import BagError
 from codetr_ros.bags.writer import McapWriter
+from helpers.bag_writing import TRANSITIONS, files, raw, sequences
+from helpers.disks import fill, small_disk
 
 
 @pytest.fixture

@@ -6,12 +6,12 @@ import signal
 import pytest
 import yaml
 from mcap.reader import make_reader
-from ros.test_bag_writer import COMMITS, TRANSITIONS, child, raw, sequences
 from rosbags.highlevel import AnyReader
 
 from codetr_ros.bags.errors import BagError
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.writer import McapWriter
+from helpers.bag_writing import COMMITS, TRANSITIONS, child, files, raw, sequences
 
 MESSAGES = 40
 SPLIT = 40_000  # several files; the definitions alone take 8 kB of each
@@ -27,11 +27,6 @@ def split_bag(folder, split_bytes=SPLIT):
 def write_all(writer):
     for i in range(MESSAGES):
         writer.write(TRANSITIONS.name, raw(i, steps=100), 1000 + i)
-
-
-def files(folder):
-    """The files of a bag in order."""
-    return sorted(folder.glob('*.mcap'), key=lambda path: int(path.stem.rsplit('_', 1)[1]))
 
 
 def test_a_bag_goes_on_in_a_new_file_at_the_given_size(tmp_path):

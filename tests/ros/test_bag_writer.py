@@ -1,32 +1,17 @@
 import os
 import signal
-import subprocess
-import sys
-import textwrap
 import zlib
-from functools import cache
 
 import pytest
-from builders import transitions
-from builtin_interfaces.msg import Time
 from mcap.stream_reader import StreamReader
-from rclpy.serialization import serialize_message
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from codetr_ros.bags.errors import BagError
-from codetr_ros.bags.topics import BagTopic, schema_text, type_hash
+from codetr_ros.bags.topics import schema_text, type_hash
 from codetr_ros.bags.writer import McapWriter
-from codetr_ros.ros import messages
-
-TRANSITIONS = BagTopic('/r/transitions', 'codetr_msgs/msg/Transitions', 100, False)
-COMMITS = BagTopic('/r/commits', 'codetr_msgs/msg/Commit', 16, True)
-
-
-@cache  # serialised twice it may differ, in the bytes that pad it
-def raw(sequence: int, **changes) -> bytes:
-    record = transitions(sequence=sequence, **changes)
-    return bytes(serialize_message(messages.to_message(record, Time(sec=sequence))))
+from helpers.bag_writing import COMMITS, TRANSITIONS, child, raw, sequences
+from helpers.builders import transitions
 
 
 def written(folder, n=20):
@@ -112,39 +97,6 @@ def test_closing_twice_changes_nothing(tmp_path):
     writer.close()
     assert {p.name: p.read_bytes() for p in writer.folder.iterdir()} == before
     assert set(before) == {'bag_0.mcap', 'metadata.yaml'}
-
-
-def sequences(path) -> list[int]:
-    """Sequence numbers in a file that may have lost its end."""
-    found = []
-    with path.open('rb') as file:
-        try:
-            for record in StreamReader(file, validate_crcs=True).records:
-                if type(record).__name__ == 'Message':
-                    found.append(record.sequence)
-        except Exception as error:  # noqa: BLE001 - where the file was cut off
-            found_end = type(error).__name__
-            assert found_end in ('EndOfFile', 'InvalidMagic', 'RecordLengthLimitExceeded')
-    return found
-
-
-CHILD = """
-    import sys
-    from pathlib import Path
-    sys.path[:0] = {paths!r}
-    from test_bag_writer import McapWriter, TRANSITIONS, raw
-    writer = McapWriter(Path({folder!r}), [TRANSITIONS])
-"""
-
-
-def child(folder, body: str) -> subprocess.Popen:
-    head = textwrap.dedent(CHILD).format(paths=sys.path, folder=str(folder))
-    return subprocess.Popen(
-        [sys.executable, '-c', head + textwrap.dedent(body)],
-        stdout=subprocess.PIPE,
-        text=True,
-        env=os.environ,
-    )
 
 
 def test_all_that_was_flushed_survives_sigkill(tmp_path):

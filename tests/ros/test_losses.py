@@ -4,14 +4,11 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from builders import commit, policy, score, step_rewards, task_spec, tiny, transitions
 from builtin_interfaces.msg import Time
 from codetr_msgs.srv import FetchPhase
 from diagnostic_msgs.msg import DiagnosticArray
-from ros.playing import NAMESPACE, output, process
 from rosbags.highlevel import AnyReader
 
-from codetr_ros import run_folder
 from codetr_ros.records import Commit, CompositeReward, Presence, RecordError, Transitions
 from codetr_ros.ros import messages
 from codetr_ros.ros.fetch import unpack
@@ -20,6 +17,9 @@ from codetr_ros.ros.patience import Patience
 from codetr_ros.ros.peers import Peers
 from codetr_ros.ros.resend import LastPhases
 from codetr_ros.ros.signals import Stop
+from codetr_ros.runs import folder as run_folder
+from helpers.builders import commit, policy, score, step_rewards, task_spec, tiny, transitions
+from helpers.playing import NAMESPACE, output, process
 
 
 def settings():

@@ -2,7 +2,6 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from builders import run, same, tiny, transitions
 from builtin_interfaces.msg import Time
 from rclpy.serialization import deserialize_message, serialize_message
 
@@ -23,6 +22,7 @@ from codetr_ros.records import (
     TrueRewards,
 )
 from codetr_ros.ros import messages, peers, qos
+from helpers.builders import run, same, tiny, transitions
 
 STAMP = Time(sec=3, nanosec=4)
 ODD = np.array(
@@ -130,10 +130,10 @@ def test_every_topic_has_a_quality_of_service_readers_and_writers():
 
 @pytest.mark.parametrize('method', ['codetr', 'hc'])
 def test_the_roles_that_read_a_topic_are_those_whose_cores_want_it(method):
-    from codetr_ros.evaluation import Evaluator
-    from codetr_ros.learners.core import Learner
-    from codetr_ros.rewards.core import Labeller
-    from codetr_ros.simulator import Simulator
+    from codetr_ros.cores.evaluator import Evaluator
+    from codetr_ros.cores.labeller import Labeller
+    from codetr_ros.cores.learner import Learner
+    from codetr_ros.cores.simulator import Simulator
 
     settings = tiny(method=method)
     spec = run(settings)

@@ -5,17 +5,17 @@ import time
 
 import numpy as np
 import pytest
-from builders import task_spec, transitions
 from codetr_msgs.srv import FetchPhase
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter
-from ros.playing import NAMESPACE, PATIENCE, everybody_matched, one_phase, output, process
 from rosbags.highlevel import AnyReader
 
-from codetr_ros import run_folder
 from codetr_ros.records import PROTOCOL_VERSION, Commit, RunSpec, StepRewards
 from codetr_ros.ros.watch import Watcher
+from codetr_ros.runs import folder as run_folder
+from helpers.builders import task_spec, transitions
+from helpers.playing import NAMESPACE, PATIENCE, everybody_matched, one_phase, output, process
 
 
 def test_a_recorder_commits_a_phase_and_keeps_every_byte_of_it(play, tmp_path):

@@ -10,18 +10,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bags.making import SETTINGS, a_run, ours, topic_of
-from builders import run, same
-from ros.playing import NAMESPACE, output, process
 
-from codetr_ros import run_folder
 from codetr_ros.bags.definitions import encode
 from codetr_ros.bags.topics import BagTopic
 from codetr_ros.bags.writer import McapWriter
-from codetr_ros.received import type_name
 from codetr_ros.records import TOPICS, Commit, CompositeReward, RunSpec, Transitions
+from codetr_ros.records.fields import type_name
 from codetr_ros.ros import messages
 from codetr_ros.ros.link import Link
+from codetr_ros.runs import folder as run_folder
+from helpers.bags import SETTINGS, a_run, ours, topic_of
+from helpers.builders import run, same
+from helpers.playing import NAMESPACE, output, process
 
 
 def uniform(phases=3):

@@ -4,17 +4,16 @@ import os
 
 import numpy as np
 import pytest
-from builders import commit, policy, score, task_spec, transitions
-from disks import fill, small_disk
 from mcap.reader import make_reader
 from rclpy.serialization import serialize_message
-from ros.playing import everybody_matched, output, process
-from ros.test_bag_splits import files
-from ros.test_bag_writer import sequences
 
-from codetr_ros import run_folder
 from codetr_ros.ros.recording import RecordNode
 from codetr_ros.ros.signals import Stop
+from codetr_ros.runs import folder as run_folder
+from helpers.bag_writing import files, sequences
+from helpers.builders import commit, policy, score, task_spec, transitions
+from helpers.disks import fill, small_disk
+from helpers.playing import everybody_matched, output, process
 
 
 @pytest.fixture

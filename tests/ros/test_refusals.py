@@ -7,22 +7,23 @@ import sys
 
 import pytest
 import yaml
-from builders import tiny
-from ros.playing import output, process
 
-from codetr_ros import middleware, run_folder
 from codetr_ros.bags.errors import BagError
-from codetr_ros.checkpoints import CheckpointError
-from codetr_ros.composite import CompositeError
 from codetr_ros.config import IN_PROCESS_ONLY, SettingsError, load
-from codetr_ros.learners.network import NetworkError
 from codetr_ros.learners.sac import SacError
+from codetr_ros.policy.acting import NetworkError
+from codetr_ros.processes import middleware
 from codetr_ros.records import RecordError
-from codetr_ros.rewards.method import RewardModelError
+from codetr_ros.rewards.base import RewardModelError
 from codetr_ros.ros import errors
 from codetr_ros.ros.node import CoreNode
 from codetr_ros.ros.signals import Stop
-from codetr_ros.tasks import TaskError
+from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs.checkpoints import CheckpointError
+from codetr_ros.simulation.composite import CompositeError
+from codetr_ros.simulation.tasks import TaskError
+from helpers.builders import tiny
+from helpers.playing import output, process
 
 
 def refusal(*parameters, role='learner'):
@@ -178,7 +179,7 @@ def test_a_node_that_is_stopped_between_two_slices_saves(play):
 
 SHOW = """
 import os
-from codetr_ros import middleware
+from codetr_ros.processes import middleware
 from codetr_ros.ros.node import CoreNode, run_node
 
 class Node(CoreNode):

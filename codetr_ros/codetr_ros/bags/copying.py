@@ -19,7 +19,7 @@ from codetr_ros.bags.definitions import bundled_text
 from codetr_ros.bags.metadata import METADATA, BagFile, load_yaml, render
 from codetr_ros.bags.raw import LIBRARY, Channel, RawMessage
 from codetr_ros.bags.writer import CHUNK_BYTES
-from codetr_ros.run_folder import atomic_write, sync_folder
+from codetr_ros.system.files import atomic_write, sync_folder
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,8 @@ from rosbags.typesys import (
 from rosbags.typesys.store import Typestore
 
 from codetr_ros.bags.errors import BagError
-from codetr_ros.received import RECORD_TYPES, record_of, type_name
 from codetr_ros.records import Record, RecordError
+from codetr_ros.records.fields import RECORD_TYPES, record_of, type_name
 
 LONGEST_DEFINITION = 1 << 20
 """Bytes that a definition in a bag may have, with all that it contains."""

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from codetr_ros.bags.findings import Findings
-from codetr_ros.intake import check_transitions
 from codetr_ros.records import (
     CompositeReward,
     RecordError,
@@ -20,6 +19,7 @@ from codetr_ros.records import (
     TrueRewards,
     describe,
 )
+from codetr_ros.records.checks import check_transitions
 
 _MOST_SKIPPED = 1_000_000  # episodes
 _MOST_EARLY = 10_000  # scores

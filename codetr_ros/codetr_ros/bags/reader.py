@@ -27,8 +27,8 @@ from codetr_ros.bags.mcap_file import McapFile
 from codetr_ros.bags.mcap_layout import LARGEST_RECORD, unzstd
 from codetr_ros.bags.raw import OnDamage, RawMessage
 from codetr_ros.bags.sqlite_file import SqliteFile
-from codetr_ros.received import RECORD_TYPES, type_name
 from codetr_ros.records import Record, RecordError
+from codetr_ros.records.fields import RECORD_TYPES, type_name
 
 _KINDS: dict[str, type[McapFile | SqliteFile]] = {'.mcap': McapFile, '.db3': SqliteFile}
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'  # no CDR message begins so

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from codetr_ros.bags.errors import BagError, BagWriteError
 from codetr_ros.bags.metadata import METADATA
-from codetr_ros.run_folder import sync_folder
+from codetr_ros.system.files import sync_folder
 
 
 @contextmanager

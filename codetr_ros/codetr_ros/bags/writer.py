@@ -27,7 +27,7 @@ from codetr_ros.bags.errors import BagError, BagWriteError
 from codetr_ros.bags.metadata import METADATA, BagFile, render
 from codetr_ros.bags.raw import LIBRARY
 from codetr_ros.bags.topics import BagTopic, schema_text, type_hash
-from codetr_ros.run_folder import atomic_write, sync_folder
+from codetr_ros.system.files import atomic_write, sync_folder
 
 CHUNK_BYTES = 64 * 1024
 """Size at which a chunk is closed by itself: what a killed process can lose of messages not yet

@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from codetr_ros import tasks
 from codetr_ros.benchmark.folder import read_json
 from codetr_ros.benchmark.results import Result
-from codetr_ros.composite import composite, perfect_score
-from codetr_ros.environments import Environment
+from codetr_ros.policy.acting import uniform_actions
 from codetr_ros.records import F32, F64
-from codetr_ros.rollout import uniform_actions
-from codetr_ros.run_folder import atomic_write
 from codetr_ros.seeding import generator
+from codetr_ros.simulation import tasks
+from codetr_ros.simulation.composite import composite, perfect_score
+from codetr_ros.simulation.environments import Environment
+from codetr_ros.system.files import atomic_write
 
 FILE = 'anchors.json'
 SEED = 0

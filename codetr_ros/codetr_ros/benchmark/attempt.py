@@ -18,9 +18,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from codetr_ros import launcher, run_folder
 from codetr_ros.benchmark.folder import Folder, finished, provenance, read_json
-from codetr_ros.run_folder import atomic_write
+from codetr_ros.processes import launcher
+from codetr_ros.runs import folder as run_folder
+from codetr_ros.system.files import atomic_write, sync_folder
 
 ERROR_LINES = 15
 """Lines of its log that a failed cell is reported with."""
@@ -135,7 +136,7 @@ class Attempt:
                 return False
             folder.set_aside(cell)
             self._place.rename(folder.run(cell))
-        run_folder.sync_folder(folder.path)
+        sync_folder(folder.path)
         return True
 
     def _why(self, code: int, summary: dict[str, Any] | None) -> str:

@@ -28,11 +28,11 @@ from typing import Any, Literal
 
 import yaml
 
-from codetr_ros import run_folder
 from codetr_ros.benchmark.spec import BenchmarkError, Cell, Spec
 from codetr_ros.config import flatten
-from codetr_ros.run_folder import atomic_write
-from codetr_ros.summary import versions
+from codetr_ros.runs import folder as run_folder
+from codetr_ros.system.files import atomic_write
+from codetr_ros.system.versions import versions
 
 SPEC = 'spec.yaml'
 INDEX = 'benchmark.json'

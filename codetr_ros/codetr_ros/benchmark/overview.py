@@ -11,8 +11,8 @@ from rich.text import Text
 
 from codetr_ros.benchmark.attempt import Job, phases_in, running
 from codetr_ros.benchmark.folder import Folder
-from codetr_ros.display import Display
-from codetr_ros.progress import duration
+from codetr_ros.runs.display import Display
+from codetr_ros.runs.progress import duration
 
 
 class Overview(Display):

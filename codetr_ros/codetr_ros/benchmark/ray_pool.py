@@ -20,7 +20,7 @@ from codetr_ros.benchmark.attempt import Attempt, Job, running
 from codetr_ros.benchmark.folder import Folder, provenance, read_json
 from codetr_ros.benchmark.overview import Overview
 from codetr_ros.benchmark.spec import BenchmarkError
-from codetr_ros.run_folder import atomic_write
+from codetr_ros.system.files import atomic_write
 
 RETRIES = 3
 """How often a cell begins again after it has lost its node."""

@@ -6,13 +6,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from codetr_ros import tasks
 from codetr_ros.benchmark import anchors as trivial
 from codetr_ros.benchmark import curves, scores, sections, table
 from codetr_ros.benchmark.document import Block, Heading, markdown, page
 from codetr_ros.benchmark.folder import Folder
 from codetr_ros.benchmark.results import Result, read
-from codetr_ros.run_folder import atomic_write
+from codetr_ros.simulation import tasks
+from codetr_ros.system.files import atomic_write
 
 REPORT = 'report'
 

@@ -3,12 +3,12 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from codetr_ros import processors
 from codetr_ros.benchmark import pool, ray_pool
 from codetr_ros.benchmark.attempt import Job
 from codetr_ros.benchmark.folder import Folder, session
 from codetr_ros.benchmark.overview import Overview
 from codetr_ros.benchmark.spec import Spec
+from codetr_ros.system import processors
 
 
 def run(

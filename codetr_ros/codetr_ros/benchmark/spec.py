@@ -24,8 +24,9 @@ from typing import Annotated, Any
 import yaml
 from pydantic import Field, ValidationError, field_validator
 
-from codetr_ros import config, tasks
+from codetr_ros import config
 from codetr_ros.config import Composite, Group, Method, Settings, SettingsError
+from codetr_ros.simulation import tasks
 
 DEFAULT_BASE = 'quick'
 _AXES = {

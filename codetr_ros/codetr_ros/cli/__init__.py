@@ -77,7 +77,7 @@ def _tasks(arguments: Sequence[str]) -> int:
 
 
 def _doctor(arguments: Sequence[str]) -> int:
-    from codetr_ros import doctor
+    from codetr_ros.cli import doctor
 
     return doctor.main(arguments)
 

@@ -11,8 +11,8 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from codetr_ros import run_folder
 from codetr_ros.cli import refuse
+from codetr_ros.runs import folder as run_folder
 
 
 @dataclasses.dataclass(frozen=True)

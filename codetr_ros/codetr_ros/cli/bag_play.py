@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from codetr_ros import middleware
 from codetr_ros.cli import refuse
+from codetr_ros.processes import middleware
 
 DEFAULT_NAMESPACE = '/play'
 _NAMESPACE = re.compile(r'/|(/[A-Za-z_][A-Za-z0-9_]*)+')

@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 
-from codetr_ros import run_folder
 from codetr_ros.cli import FAILED, refuse
+from codetr_ros.runs import folder as run_folder
 
 SHOWN = 20
 """Losses that are printed; `--json` has more."""

@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from codetr_ros.cli import FAILED, INTERRUPTED, refuse
-from codetr_ros.cli.supervise import Interrupts
+from codetr_ros.processes.supervise import Interrupts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,7 +113,7 @@ def _run(given: Run) -> int:
 
 def _report(given: Report) -> int:
     from codetr_ros.benchmark import report, spec
-    from codetr_ros.tasks import TaskError
+    from codetr_ros.simulation.tasks import TaskError
 
     if not given.folders:
         return refuse('benchmark report: give the folder of a benchmark')

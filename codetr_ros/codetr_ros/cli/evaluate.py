@@ -10,11 +10,11 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from codetr_ros import run_folder
 from codetr_ros.cli import refuse
 from codetr_ros.config import Settings, SettingsError
 from codetr_ros.records import EpisodeResult, Policy
-from codetr_ros.run_folder import RunFolderError
+from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs.folder import RunFolderError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,9 +56,9 @@ def main(arguments: Sequence[str]) -> int:
     except (RunFolderError, SettingsError) as error:
         return refuse(str(error))
 
-    from codetr_ros.checkpoints import CheckpointError
-    from codetr_ros.learners.learner import LearnerError
-    from codetr_ros.tasks import TaskError
+    from codetr_ros.learners.base import LearnerError
+    from codetr_ros.runs.checkpoints import CheckpointError
+    from codetr_ros.simulation.tasks import TaskError
 
     try:
         policy = newest_policy(folder, settings)
@@ -83,8 +83,9 @@ def newest_policy(folder: Path, settings: Settings) -> Policy:
         CheckpointError: the checkpoint is damaged.
         LearnerError: it is of other settings than the run's folder has.
     """
-    from codetr_ros import checkpoints
-    from codetr_ros.learners import methods, network
+    from codetr_ros.learners import registry
+    from codetr_ros.policy.actor import weights_bytes
+    from codetr_ros.runs import checkpoints
 
     place = folder / run_folder.CHECKPOINTS
     path = checkpoints.latest(place, 'learner')
@@ -100,7 +101,7 @@ def newest_policy(folder: Path, settings: Settings) -> Policy:
             f'{path} is from the warm-up ({settings.warmup_steps} steps): '
             'its policy has learnt nothing yet'
         )
-    learner = methods.make(settings, meta['observation_size'], meta['action_size'])
+    learner = registry.make(settings, meta['observation_size'], meta['action_size'])
     learner.load_state({name: t for name, t in tensors.items() if not name.startswith('labels/')})
     return Policy(
         run_id='evaluate',
@@ -110,7 +111,7 @@ def newest_policy(folder: Path, settings: Settings) -> Policy:
         steps=np.zeros(0, np.uint32),
         random=False,
         network=learner.network,
-        weights=network.weights_bytes(learner.actor),
+        weights=weights_bytes(learner.actor),
     )
 
 
@@ -118,7 +119,7 @@ def evaluate(policy: Policy, settings: Settings) -> list[EpisodeResult]:
     """`settings.evaluate_episodes` episodes of this policy, without noise."""
     import torch
 
-    from codetr_ros.evaluation import Evaluator
+    from codetr_ros.cores.evaluator import Evaluator
 
     torch.set_num_threads(settings.threads)
     evaluator = Evaluator(settings.run_spec(policy.run_id), settings, 'evaluate')

@@ -10,14 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from rich.console import Console
 
-from codetr_ros import config, run_folder
+from codetr_ros import config
 from codetr_ros.bags.errors import BagError
 from codetr_ros.cli import FAILED, refuse
 from codetr_ros.cli.flags import settings_fields
 from codetr_ros.config import Settings, SettingsError
 from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.settings import OF_NO_EFFECT, FitSettings
-from codetr_ros.run_folder import RunFolderError
+from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs.folder import RunFolderError
 
 if TYPE_CHECKING:
     from codetr_ros.offline.episodes import Index
@@ -119,9 +120,9 @@ def main(arguments: Sequence[str]) -> int:
         run_folder.check(given.out)
     except (SettingsError, RunFolderError) as error:
         return refuse(str(error))
-    from codetr_ros.checkpoints import CheckpointError
-    from codetr_ros.devices import DeviceError
-    from codetr_ros.rewards import RewardModelError
+    from codetr_ros.rewards.base import RewardModelError
+    from codetr_ros.runs.checkpoints import CheckpointError
+    from codetr_ros.system.devices import DeviceError
 
     try:
         return (_phases if given.fit.schedule == 'phases' else _epochs)(arguments, given)
@@ -133,10 +134,10 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _epochs(arguments: Sequence[str], given: Arguments) -> int:
-    from codetr_ros import checkpoints
     from codetr_ros.offline import fitting, judging, report, results
     from codetr_ros.offline.episodes import stretches
     from codetr_ros.rewards import saved
+    from codetr_ros.runs import checkpoints
 
     if given.frozen:
         raise FitError('--frozen: a frozen model is not fitted; it is for --schedule phases')
@@ -208,7 +209,7 @@ def _index(given: Arguments) -> 'tuple[Index, Console]':
 
 
 def _refuse_unfit(settings: Settings) -> None:
-    from codetr_ros.rewards import METHODS
+    from codetr_ros.rewards.registry import METHODS
 
     fit = [name for name in METHODS if name not in config.IN_PROCESS_ONLY]
     if settings.method not in fit:

@@ -51,10 +51,11 @@ def main(arguments: Sequence[str]) -> int:
     given = tyro.cli(Arguments, prog='codetr label', args=arguments)
     if given.memory_steps < 1:
         return refuse(f'--memory-steps {given.memory_steps}: at least 1 step must be held')
-    from codetr_ros.checkpoints import CheckpointError
-    from codetr_ros.devices import DeviceError
     from codetr_ros.offline import labelling, sources
-    from codetr_ros.rewards import RewardModelError, saved
+    from codetr_ros.rewards import saved
+    from codetr_ros.rewards.base import RewardModelError
+    from codetr_ros.runs.checkpoints import CheckpointError
+    from codetr_ros.system.devices import DeviceError
 
     try:
         (bag,) = sources.open_bags([Path(given.bag)])

@@ -7,7 +7,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from codetr_ros import tasks
+from codetr_ros.simulation import tasks
 
 
 @dataclasses.dataclass(frozen=True)

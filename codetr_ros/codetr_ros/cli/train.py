@@ -14,25 +14,22 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from codetr_ros import config, launcher, report, run_folder
+from codetr_ros import config
 from codetr_ros.cli import FAILED, INTERRUPTED, refuse
 from codetr_ros.cli.flags import parse
-from codetr_ros.cli.supervise import Interrupts, Silence, supervise, why_it_gave_up
 from codetr_ros.config import Settings, SettingsError
-from codetr_ros.launcher import LaunchError
-from codetr_ros.progress import Progress
-from codetr_ros.records import (
-    Commit,
-    EpisodeResult,
-    Metrics,
-    Record,
-    StepRewards,
-    TrueRewards,
-)
-from codetr_ros.recovery import RecoveryError
-from codetr_ros.run_folder import RunFolderError
-from codetr_ros.summary import Summary
-from codetr_ros.summary import write as write_summary
+from codetr_ros.processes import launcher
+from codetr_ros.processes.launcher import LaunchError
+from codetr_ros.processes.supervise import Interrupts, Silence, supervise, why_it_gave_up
+from codetr_ros.records import Commit, EpisodeResult, Metrics, Record, StepRewards, TrueRewards
+from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs import report
+from codetr_ros.runs.folder import RunFolderError
+from codetr_ros.runs.progress import Progress
+from codetr_ros.runs.recovery import RecoveryError
+from codetr_ros.runs.summary import Summary
+from codetr_ros.runs.summary import write as write_summary
+from codetr_ros.system.files import atomic_write
 
 DESCRIPTION = """Train on a task.
 
@@ -53,7 +50,7 @@ class Outcome:
 
 def main(arguments: Sequence[str]) -> int:
     """Train as the command line says; the exit code."""
-    from codetr_ros import tasks
+    from codetr_ros.simulation import tasks
 
     more = [
         (
@@ -159,7 +156,7 @@ def _in_process(
 ) -> Outcome:
     # Before torch is imported: the same threads as the nodes have, for the same bits.
     os.environ.update(launcher.threading_environment(settings))
-    from codetr_ros import in_process
+    from codetr_ros.cores import in_process
 
     def observe(record: Record) -> None:
         summary.receive(record)
@@ -179,7 +176,7 @@ def _in_process(
     except Exception as error:  # noqa: BLE001
         # Whatever it was: what was learnt until now is worth a summary, which names the failure.
         log = folder / run_folder.LOGS / 'in_process.log'
-        run_folder.atomic_write(log, traceback.format_exc())
+        atomic_write(log, traceback.format_exc())
         reports = run_folder.read_reports(folder)
         return Outcome(reports, failure=f'{type(error).__name__}: {error}', log=log)
     finally:

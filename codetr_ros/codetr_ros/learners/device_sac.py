@@ -19,10 +19,10 @@ import torch
 from torch import Tensor
 
 from codetr_ros.config import SacSettings
-from codetr_ros.devices import usable
-from codetr_ros.learners.device_memory import DeviceMemory, columns
 from codetr_ros.learners.flat_sac import FlatSAC
-from codetr_ros.trajectories import Trajectories
+from codetr_ros.memory.on_device import DeviceMemory, columns
+from codetr_ros.memory.trajectories import Trajectories
+from codetr_ros.system.devices import usable
 
 Call: TypeAlias = Callable[[], None]
 WARM_UP_CALLS = 3

@@ -18,12 +18,12 @@ import torch
 from torch import Tensor, nn
 from torch.optim.adam import adam
 
-from codetr_ros import freed_memory
-from codetr_ros.compilation import compiled
 from codetr_ros.config import SacSettings
-from codetr_ros.learners.network import LOG_STD_RANGE
 from codetr_ros.learners.sac import SAC, Adam, squashed_gaussian
-from codetr_ros.trajectories import StepBatch
+from codetr_ros.memory.batches import StepBatch
+from codetr_ros.policy.actor import LOG_STD_RANGE
+from codetr_ros.system import freed_memory
+from codetr_ros.system.compilation import compiled
 
 METRICS = ('critic_loss', 'actor_loss', 'temperature', 'entropy', 'q_mean')
 """What `SAC.update` says, in the order in which it is summed here."""

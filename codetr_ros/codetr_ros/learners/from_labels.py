@@ -7,11 +7,11 @@ import numpy as np
 from torch import Tensor
 
 from codetr_ros.config import Settings
-from codetr_ros.learners import network
+from codetr_ros.learners.base import OffPolicy
 from codetr_ros.learners.device_sac import DeviceSAC
 from codetr_ros.learners.flat_sac import FlatSAC
-from codetr_ros.learners.learner import OffPolicy
-from codetr_ros.trajectories import Trajectories
+from codetr_ros.memory.trajectories import Trajectories
+from codetr_ros.policy.actor import Actor, describe
 
 
 class FromLabels(OffPolicy):
@@ -28,14 +28,14 @@ class FromLabels(OffPolicy):
     def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
         super().__init__(settings)
         self._sac = self._make(observation_size, action_size)
-        self.network = network.describe(observation_size, action_size, settings.sac.hidden)
+        self.network = describe(observation_size, action_size, settings.sac.hidden)
 
     def _make(self, observation_size: int, action_size: int) -> FlatSAC:
         settings = self._settings
         return FlatSAC(observation_size, action_size, settings.sac, settings.seed)
 
     @property
-    def actor(self) -> network.Actor:
+    def actor(self) -> Actor:
         """The policy network."""
         return self._sac.actor
 

@@ -42,12 +42,11 @@ from torch import Tensor, nn
 
 from codetr_ros import seeding
 from codetr_ros.config import Settings
-from codetr_ros.learners import network
+from codetr_ros.learners.base import OffPolicy, add, check_state
 from codetr_ros.learners.histories import HISTORIES, HistoryBatch, ScoredSteps
-from codetr_ros.learners.learner import OffPolicy, add, check_state
 from codetr_ros.learners.sac import Adam, q_values, squashed_gaussian, twin_critic
-from codetr_ros.rewards.method import measure_scale
-from codetr_ros.trajectories import Trajectories
+from codetr_ros.memory.trajectories import Trajectories, measure_scale
+from codetr_ros.policy.actor import Actor, describe
 
 
 class Critic(nn.Module):
@@ -83,8 +82,8 @@ class HC(OffPolicy):
         sac = settings.sac
         self.target_scale = 0.0
         self._steps: ScoredSteps | None = None
-        self._actor = network.Actor(observation_size + 1, action_size, sac.hidden)
-        self.network = network.describe(observation_size, action_size, sac.hidden, settings.delay)
+        self._actor = Actor(observation_size + 1, action_size, sac.hidden)
+        self.network = describe(observation_size, action_size, sac.hidden, settings.delay)
         self.critic = Critic(settings, observation_size, action_size)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
         self.target_entropy = sac.target_entropy * action_size
@@ -96,7 +95,7 @@ class HC(OffPolicy):
         }
 
     @property
-    def actor(self) -> network.Actor:
+    def actor(self) -> Actor:
         """The policy network."""
         return self._actor
 

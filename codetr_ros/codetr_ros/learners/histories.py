@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 from codetr_ros.config import HcSettings
 from codetr_ros.learners.sac import q_values, twin_critic
+from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import F32, F64, I64
-from codetr_ros.trajectories import Trajectories
 
 
 @dataclass(frozen=True, eq=False, slots=True)

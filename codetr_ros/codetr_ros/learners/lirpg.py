@@ -53,9 +53,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from codetr_ros.config import Settings
-from codetr_ros.learners import network
-from codetr_ros.learners.learner import LearnerError, check_state
-from codetr_ros.learners.network import StandardisedActor, standardise
+from codetr_ros.learners.base import LearnerError, check_state
 from codetr_ros.learners.on_policy import (
     DifferentiableAdam,
     RunningMoments,
@@ -65,10 +63,11 @@ from codetr_ros.learners.on_policy import (
     normalised,
     trace,
 )
+from codetr_ros.memory.ring import Rollout
+from codetr_ros.memory.trajectories import Trajectories
+from codetr_ros.policy.actor import StandardisedActor, describe, orthogonal, standardise
 from codetr_ros.records import F32
 from codetr_ros.seeding import generator, seed_torch
-from codetr_ros.source_ring import Rollout
-from codetr_ros.trajectories import Trajectories
 
 KIND = 'standardised_tanh_gaussian_mlp'
 REWARD_CLIP = 10.0
@@ -82,9 +81,9 @@ def perceptron(inputs: int, hidden: Sequence[int], gain: float) -> nn.Sequential
     body = nn.Sequential()
     for width, following in pairwise([inputs, *hidden]):
         body.extend([nn.Linear(width, following), nn.Tanh()])
-    network.orthogonal(body, math.sqrt(2))
+    orthogonal(body, math.sqrt(2))
     head = nn.Sequential(nn.Linear(hidden[-1], 1))
-    network.orthogonal(head, gain)
+    orthogonal(head, gain)
     return body.extend(head)
 
 
@@ -119,7 +118,7 @@ class Lirpg:
         self.updates = 0
         self.counters: Counter[str] = Counter()
         self.actor = StandardisedActor(observation_size, action_size, own.hidden)
-        self.network = network.describe(observation_size, action_size, own.hidden, kind=KIND)
+        self.network = describe(observation_size, action_size, own.hidden, kind=KIND)
         self.value = perceptron(observation_size, own.hidden, 1.0)
         self.extrinsic_value = perceptron(observation_size, own.hidden, 1.0)
         self.intrinsic_reward = perceptron(observation_size + action_size, own.hidden, 1.0)

@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from codetr_ros.memory.ring import Rollout
 from codetr_ros.records import F32, F64, I64
-from codetr_ros.source_ring import Rollout
 
 
 class RunningMoments:

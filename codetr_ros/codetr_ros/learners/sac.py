@@ -21,9 +21,9 @@ from torch.optim.adam import adam
 
 from codetr_ros import seeding
 from codetr_ros.config import SacSettings
-from codetr_ros.learners.learner import LearnerError
-from codetr_ros.learners.network import Actor
-from codetr_ros.trajectories import StepBatch
+from codetr_ros.learners.base import LearnerError
+from codetr_ros.memory.batches import StepBatch
+from codetr_ros.policy.actor import Actor
 
 
 class SacError(LearnerError):

@@ -12,8 +12,8 @@ from codetr_ros.bags.writer import McapWriter
 from codetr_ros.offline.converting import Conversion, Converter, Timed
 from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.mapping import Mapping
-from codetr_ros.received import type_name
 from codetr_ros.records import TOPICS, CompositeReward, Transitions
+from codetr_ros.records.fields import type_name
 
 
 def convert(bag: Bag, rules: Mapping, folder: Path) -> Conversion:

@@ -19,13 +19,14 @@ from itertools import count
 import numpy as np
 import torch
 
-from codetr_ros import rewards
 from codetr_ros.bags.reader import Bag
 from codetr_ros.config import Settings
 from codetr_ros.offline.episodes import Stretch
 from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.loading import Loaded, load
 from codetr_ros.offline.settings import FitSettings
+from codetr_ros.rewards import registry
+from codetr_ros.rewards.base import RewardMethod, RewardModelError
 from codetr_ros.rewards.learned import Learned
 from codetr_ros.seeding import generator, seed_torch
 
@@ -60,7 +61,7 @@ class Check:
 class Fitted:
     """What came out of a fit."""
 
-    method: rewards.RewardMethod  # with its best weights
+    method: RewardMethod  # with its best weights
     held_out: Loaded
     begun_at: int = 0  # gradient steps of the model that it began with
     curve: list[Check] = field(default_factory=list)
@@ -134,7 +135,7 @@ def fit(
     settings: Settings,
     how: FitSettings,
     say: Callable[[Check], None] = lambda check: None,
-    method: rewards.RewardMethod | None = None,
+    method: RewardMethod | None = None,
 ) -> Fitted:
     """Fit a reward method to what the plan says.
 
@@ -158,12 +159,12 @@ def fit(
     """
     torch.set_num_threads(settings.threads)
     began = time.perf_counter()
-    method = method or rewards.make(settings, *sizes)
+    method = method or registry.make(settings, *sizes)
     held_out = load(bags, made.held_out, sizes, settings.delay, true_rewards=True)
     found = Fitted(method, held_out, method.gradient_steps, reads=1)
     try:
         _fit(bags, made, sizes, settings, how, found, say)
-    except (KeyboardInterrupt, rewards.RewardModelError) as error:
+    except (KeyboardInterrupt, RewardModelError) as error:
         if found.kept is None:
             raise
         words = 'by Ctrl-C' if isinstance(error, KeyboardInterrupt) else str(error)
@@ -264,7 +265,7 @@ def held_out_loss(method: Learned, loaded: Loaded) -> float:
     error = (predictions(method, loaded) - true) / method.target_scale
     loss = float(np.mean(error**2))
     if not np.isfinite(loss):
-        raise rewards.RewardModelError(
+        raise RewardModelError(
             f'the held-out loss is {loss} after {method.gradient_steps} gradient steps: training '
             f'has diverged. Lower {method.group}.learning_rate'
         )

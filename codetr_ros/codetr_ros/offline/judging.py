@@ -9,11 +9,11 @@ from codetr_ros.config import Settings
 from codetr_ros.offline.fitting import BATCH, predictions
 from codetr_ros.offline.loading import Loaded
 from codetr_ros.records import F32, F64, I64
-from codetr_ros.recovery_metrics import r_squared, step_recovery
+from codetr_ros.rewards.base import RewardMethod
 from codetr_ros.rewards.codetr import Codetr
 from codetr_ros.rewards.ircr import Ircr
 from codetr_ros.rewards.learned import Learned
-from codetr_ros.rewards.method import RewardMethod
+from codetr_ros.runs.recovery_metrics import r_squared, step_recovery
 
 MEASURES = (
     *('segments', 'composite_r2', 'segments_with_true_rewards'),

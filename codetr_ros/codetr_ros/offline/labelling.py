@@ -21,13 +21,13 @@ from codetr_ros.bags.raw import LIBRARY, Channel, RawMessage
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.topics import BagTopic, schema_text, type_hash
 from codetr_ros.bags.unfinished import unfinished
+from codetr_ros.cores.labeller import PART_BYTES
 from codetr_ros.offline.episodes import Index, Key, Stretch, stretches
 from codetr_ros.offline.judging import labels_of
 from codetr_ros.offline.loading import load
-from codetr_ros.received import type_name
 from codetr_ros.records import TOPICS, StepRewards
-from codetr_ros.rewards.core import PART_BYTES
-from codetr_ros.rewards.method import RewardMethod, RewardModelError
+from codetr_ros.records.fields import type_name
+from codetr_ros.rewards.base import RewardMethod, RewardModelError
 from codetr_ros.rewards.saved import SavedModel, restore
 
 STRETCH_STEPS = 10_000

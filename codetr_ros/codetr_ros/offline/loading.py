@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from codetr_ros.bags.reader import Bag
+from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.offline.episodes import Key, Stretch, sound
 from codetr_ros.offline.errors import FitError
 from codetr_ros.records import F32, CompositeReward, Transitions, TrueRewards
-from codetr_ros.trajectories import Trajectories
 
 SOURCE = 'data'
 """Name under which a memory holds the steps of all sources: stretch after stretch."""

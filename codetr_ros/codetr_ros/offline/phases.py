@@ -16,17 +16,9 @@ import torch
 from codetr_ros.bags.causal import causal
 from codetr_ros.bags.reader import Bag
 from codetr_ros.config import Settings
+from codetr_ros.cores.labeller import Labeller
 from codetr_ros.offline.errors import FitError
-from codetr_ros.records import (
-    TOPICS,
-    Commit,
-    Metrics,
-    Record,
-    RecordError,
-    RunSpec,
-    StepRewards,
-)
-from codetr_ros.rewards.core import Labeller
+from codetr_ros.records import TOPICS, Commit, Metrics, Record, RecordError, RunSpec, StepRewards
 
 NODE = 'reward'
 """Name under which the core speaks; nothing is learnt from it."""

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from codetr_ros import run_folder
 from codetr_ros.offline.judging import Judgement, Shown
 from codetr_ros.offline.results import rows
 from codetr_ros.offline.settings import OF_NO_EFFECT
-from codetr_ros.pages import STYLE, flat, table, text
+from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs.pages import STYLE, flat, table, text
+from codetr_ros.system.files import atomic_write
 
 _TRUE, _INFERRED, _GREY = '#1f5fa8', '#b8561c', '#555'
 _MOST_POINTS = 5000
@@ -31,7 +32,7 @@ def title(summary: Mapping[str, Any]) -> str:
 
 def write(folder: Path, summary: Mapping[str, Any], judged: Judgement | None) -> None:
     """Write the page into the folder of a fit."""
-    run_folder.atomic_write(folder / run_folder.REPORT, page(summary, judged))
+    atomic_write(folder / run_folder.REPORT, page(summary, judged))
 
 
 def page(summary: Mapping[str, Any], judged: Judgement | None) -> str:

@@ -9,7 +9,6 @@ from typing import Any
 
 from rich.console import Console
 
-from codetr_ros import checkpoints, run_folder
 from codetr_ros.bags.reader import Bag
 from codetr_ros.config import Settings
 from codetr_ros.offline.episodes import Index, Stretches
@@ -17,7 +16,10 @@ from codetr_ros.offline.fitting import Fitted
 from codetr_ros.offline.judging import MEASURES, Judgement
 from codetr_ros.offline.phases import Fold
 from codetr_ros.offline.settings import FitSettings
-from codetr_ros.run_folder import RunFolderError
+from codetr_ros.runs import checkpoints
+from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs.folder import RunFolderError
+from codetr_ros.system.files import atomic_write
 
 DIGEST = 'reward_model_sha256'
 
@@ -159,7 +161,7 @@ def of_epochs(
 def write(folder: Path, summary: Mapping[str, Any]) -> None:
     """Write `summary.json` into the folder of a fit."""
     text = json.dumps(summary, indent=2) + '\n'
-    run_folder.atomic_write(folder / run_folder.SUMMARY, text)
+    atomic_write(folder / run_folder.SUMMARY, text)
 
 
 def rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:

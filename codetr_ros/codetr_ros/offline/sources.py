@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from codetr_ros import run_folder
 from codetr_ros.bags.reader import Bag
 from codetr_ros.config import Settings, from_canonical
 from codetr_ros.offline.errors import FitError
 from codetr_ros.records import RunSpec
+from codetr_ros.runs import folder as run_folder
 
 
 def open_bags(paths: Sequence[Path]) -> list[Bag]:

@@ -9,11 +9,12 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from codetr_ros.config import Settings
+from codetr_ros.memory.batches import SegmentBatch
+from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import F32, F64
-from codetr_ros.rewards.method import segment_steps
+from codetr_ros.rewards.base import segment_steps
 from codetr_ros.rewards.sequence import SequenceMethod
 from codetr_ros.rewards.transformer import RewardTransformer
-from codetr_ros.trajectories import SegmentBatch, Trajectories
 
 
 class Codetr(SequenceMethod):

@@ -30,9 +30,10 @@ import numpy as np
 import torch
 
 from codetr_ros.config import Settings
+from codetr_ros.memory.batches import SegmentBatch
+from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import F32
-from codetr_ros.rewards.method import RewardMethod, segment_steps
-from codetr_ros.trajectories import SegmentBatch, Trajectories
+from codetr_ros.rewards.base import RewardMethod, segment_steps
 
 
 class Ircr(RewardMethod):

@@ -11,16 +11,12 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from codetr_ros.config import CodetrSettings, PerceptronSettings, Settings
-from codetr_ros.devices import usable
+from codetr_ros.memory.batches import SegmentBatch
+from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import F32, F64
-from codetr_ros.rewards.method import (
-    RewardMethod,
-    RewardModelError,
-    Schedule,
-    segment_steps,
-)
+from codetr_ros.rewards.base import RewardMethod, RewardModelError, Schedule, segment_steps
 from codetr_ros.seeding import seed_torch
-from codetr_ros.trajectories import SegmentBatch, Trajectories
+from codetr_ros.system.devices import usable
 
 STD_FLOOR = 1e-2
 """Least standard deviation by which an observation component is divided (decided here).

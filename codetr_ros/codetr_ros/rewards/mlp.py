@@ -15,9 +15,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from codetr_ros.memory.batches import SegmentBatch
+from codetr_ros.memory.trajectories import Trajectories
+from codetr_ros.rewards.base import segment_steps
 from codetr_ros.rewards.learned import CLIP, Learned
-from codetr_ros.rewards.method import segment_steps
-from codetr_ros.trajectories import SegmentBatch, Trajectories
 
 
 class Mlp(Learned):

@@ -42,11 +42,11 @@ import torch
 from torch import Tensor, nn
 
 from codetr_ros.config import CodetrSettings, Settings
+from codetr_ros.memory.trajectories import Trajectories
+from codetr_ros.rewards.base import segment_steps
 from codetr_ros.rewards.learned import CLIP
-from codetr_ros.rewards.method import segment_steps
 from codetr_ros.rewards.sequence import SequenceMethod
 from codetr_ros.rewards.transformer import CausalTransformer, SequenceWeights, initialise
-from codetr_ros.trajectories import Trajectories
 
 
 class Rbt(SequenceMethod):

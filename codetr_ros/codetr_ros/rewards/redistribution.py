@@ -9,9 +9,9 @@ from abc import abstractmethod
 
 import numpy as np
 
+from codetr_ros.memory.batches import SegmentBatch
 from codetr_ros.records import F32, F64
-from codetr_ros.rewards.method import RewardMethod, RewardModelError, segment_steps
-from codetr_ros.trajectories import SegmentBatch
+from codetr_ros.rewards.base import RewardMethod, RewardModelError, segment_steps
 
 
 class Redistribution(RewardMethod):

@@ -34,10 +34,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from codetr_ros.memory.batches import SegmentBatch
+from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import I64
 from codetr_ros.rewards.learned import CLIP, Learned
 from codetr_ros.rewards.mlp import perceptron
-from codetr_ros.trajectories import SegmentBatch, Trajectories
 
 
 class Rrd(Learned):

@@ -10,11 +10,13 @@ from pathlib import Path
 
 import torch
 
-from codetr_ros import checkpoints, rewards, run_folder
-from codetr_ros.checkpoints import CheckpointError
 from codetr_ros.config import Settings, from_canonical
-from codetr_ros.rewards.method import RewardMethod, RewardModelError
+from codetr_ros.rewards import registry
+from codetr_ros.rewards.base import RewardMethod, RewardModelError
 from codetr_ros.rewards.sequence import SequenceMethod
+from codetr_ros.runs import checkpoints
+from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs.checkpoints import CheckpointError
 
 _log = logging.getLogger(__name__)
 
@@ -106,7 +108,7 @@ def restore(
             f'checkpoint {saved.path} has {"; ".join(wrong)}: it means something else there. Use '
             "the checkpoint's settings (its run's or fit's config.yaml), or fit another model"
         )
-    method = rewards.make(settings, observation_size, action_size)
+    method = registry.make(settings, observation_size, action_size)
     method.load_state(saved.tensors)
     if not method.target_scale:
         raise RewardModelError(
@@ -131,7 +133,7 @@ def _differing(theirs: Settings, ours: Settings) -> list[tuple[str, object, obje
     """Settings that shape a model and its labels, as the two sides have them."""
     if theirs.method != ours.method:
         return [('method', theirs.method, ours.method)]
-    kind = rewards.kind(ours)
+    kind = registry.kind(ours)
     groups = {getattr(kind, 'group', ''), ours.method}
     mine, saved = ours.flat(), theirs.flat()
     names = [*_SHARED, *(['delay'] if issubclass(kind, SequenceMethod) else [])]

@@ -10,13 +10,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from codetr_ros import freed_memory
 from codetr_ros.config import CodetrSettings, Settings
+from codetr_ros.memory.batches import SegmentBatch
+from codetr_ros.memory.on_device import DeviceSteps
+from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import F32
-from codetr_ros.rewards.device_steps import DeviceSteps
+from codetr_ros.rewards.base import RewardModelError, segment_steps
 from codetr_ros.rewards.learned import Learned
-from codetr_ros.rewards.method import RewardModelError, segment_steps
-from codetr_ros.trajectories import SegmentBatch, Trajectories
+from codetr_ros.system import freed_memory
 
 PART_BYTES = 16 << 20
 """Upper bound of one window's or several windows' activations of one kind, where more than one

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from codetr_ros import run_folder, tasks
 from codetr_ros.config import IN_PROCESS_ONLY, Settings, from_canonical
 from codetr_ros.records import Presence, RunSpec
 from codetr_ros.ros import parameters
@@ -15,6 +14,8 @@ from codetr_ros.ros.fetch import Fetcher
 from codetr_ros.ros.member import Member
 from codetr_ros.ros.patience import NAME_EVERY
 from codetr_ros.ros.peers import WRITERS, published_by, readers
+from codetr_ros.runs import folder as run_folder
+from codetr_ros.simulation import tasks
 
 IDLE = 0.05  # [s] blocked in the executor while there is nothing to do: the longest a signal waits
 NAME_PATIENCE = 2.0  # [s] for the name of a node whose topics are known

@@ -29,7 +29,7 @@ from codetr_ros.ros.peers import Ledger, Peers, published_by
 from codetr_ros.ros.signals import Stop
 
 if TYPE_CHECKING:
-    from codetr_ros.in_process import Core
+    from codetr_ros.cores.core import Core
 
 MakeCore = Callable[..., 'Core']
 """Makes the core of a node: (run, settings, name within the run, folder of checkpoints or None),

@@ -17,8 +17,8 @@ import codetr_msgs.msg
 import numpy as np
 from builtin_interfaces.msg import Time
 
-from codetr_ros.received import PACKAGE, RECORD_TYPES, record_of, type_name
 from codetr_ros.records import Record, RecordError
+from codetr_ros.records.fields import PACKAGE, RECORD_TYPES, record_of, type_name
 
 _SEQUENCES: dict[str, tuple[str, Any]] = {
     'float': ('f', np.float32),

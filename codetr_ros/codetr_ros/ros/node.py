@@ -23,13 +23,14 @@ from typing import Any
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
-from codetr_ros import middleware, run_folder
+from codetr_ros.processes import middleware
 from codetr_ros.records import TOPICS, Record
 from codetr_ros.ros import errors, signals
 from codetr_ros.ros.joining import IDLE, Joining
 from codetr_ros.ros.member import MakeCore
 from codetr_ros.ros.patience import Patience
 from codetr_ros.ros.signals import Stop
+from codetr_ros.runs import folder as run_folder
 
 ACK_DEADLINE = 5.0  # [s] at the end for readers that have not everything yet
 STOPPED_DEADLINE = 0.1  # [s] the same when the process was asked to stop

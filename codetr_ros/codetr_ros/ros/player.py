@@ -21,13 +21,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from codetr_ros.bags.playback import Item, Pace, Playback, Recorded
 from codetr_ros.config import Settings
-from codetr_ros.records import (
-    TOPICS,
-    Commit,
-    EpisodeResult,
-    Metrics,
-    RunSpec,
-)
+from codetr_ros.records import TOPICS, Commit, EpisodeResult, Metrics, RunSpec
 from codetr_ros.ros import signals
 from codetr_ros.ros.errors import NodeError
 from codetr_ros.ros.link import Link

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 def load() -> 'MakeCore':
     """Import the core and return what makes it."""
-    from codetr_ros.recorder import Recorder
+    from codetr_ros.cores.recorder import Recorder
 
     return lambda run, settings, name, folder: Recorder(run, settings, name)
 

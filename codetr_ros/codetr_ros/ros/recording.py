@@ -16,26 +16,18 @@ from typing import Any
 
 from rclpy.serialization import deserialize_message, serialize_message
 
-from codetr_ros import run_folder
 from codetr_ros.bags.first_labels import FirstLabels
 from codetr_ros.bags.topics import BagTopic
 from codetr_ros.bags.writer import McapWriter
 from codetr_ros.config import Settings
-from codetr_ros.intake import check_run
-from codetr_ros.records import (
-    TOPICS,
-    Commit,
-    Presence,
-    Record,
-    RecordError,
-    RunSpec,
-    StepRewards,
-)
+from codetr_ros.records import TOPICS, Commit, Presence, Record, RecordError, RunSpec, StepRewards
+from codetr_ros.records.checks import check_run
 from codetr_ros.ros import messages, qos
 from codetr_ros.ros.node import CoreNode, MakeCore
 from codetr_ros.ros.peers import published_by
 from codetr_ros.ros.resend import Resender
 from codetr_ros.ros.signals import Stop
+from codetr_ros.runs import folder as run_folder
 
 NOT_RECORDED = (Presence,)
 """Says who is alive, once a second: nothing of the run itself."""

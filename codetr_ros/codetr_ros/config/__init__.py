@@ -1,0 +1,42 @@
+"""The one configuration of a run: typed, validated, and the origin of CLI flags, YAML keys and ROS
+parameters.
+"""
+
+from codetr_ros.config.base import Group, SettingsError, explain, flatten, validate
+from codetr_ros.config.loading import PRESETS, from_canonical, load, parse
+from codetr_ros.config.methods import (
+    CodetrSettings,
+    HcSettings,
+    LirpgSettings,
+    MlpSettings,
+    PerceptronSettings,
+    RbtSettings,
+    RrdSettings,
+    SacSettings,
+)
+from codetr_ros.config.run import IN_PROCESS_ONLY, SCORE_LEARNERS, Composite, Method, Settings
+
+__all__ = [
+    'IN_PROCESS_ONLY',
+    'PRESETS',
+    'SCORE_LEARNERS',
+    'CodetrSettings',
+    'Composite',
+    'Group',
+    'HcSettings',
+    'LirpgSettings',
+    'Method',
+    'MlpSettings',
+    'PerceptronSettings',
+    'RbtSettings',
+    'RrdSettings',
+    'SacSettings',
+    'Settings',
+    'SettingsError',
+    'explain',
+    'flatten',
+    'from_canonical',
+    'load',
+    'parse',
+    'validate',
+]

@@ -1,0 +1,65 @@
+"""Settings from a preset, a YAML file, or the JSON of a run."""
+
+import json
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from codetr_ros.config.base import SettingsError, validate
+from codetr_ros.config.run import Settings
+
+PRESETS = ('quick', 'cpu', 'paper')
+
+
+def parse(data: Mapping[str, Any], source: str) -> Settings:
+    """Validate settings that came from outside.
+
+    Args:
+        data: nested mapping of settings; what is missing keeps its default.
+        source: where they came from (a file, a node, the command line), for the error.
+
+    Raises:
+        SettingsError: names every offending setting, its value and what is allowed.
+    """
+    return validate(Settings, data, source)
+
+
+def load(name: str) -> Settings:
+    """Settings of a preset (`quick`, `cpu`, `paper`) or of a YAML file.
+
+    Raises:
+        SettingsError: no such preset or file, not YAML, or a setting that is refused.
+    """
+    if name in PRESETS:
+        text = resources.files('codetr_ros.config.presets').joinpath(f'{name}.yaml').read_text()
+        source = f'preset {name}'
+    else:
+        path = Path(name)
+        if not path.is_file():
+            raise SettingsError(
+                f'config {name!r} is neither a preset ({", ".join(PRESETS)}) nor a file'
+            )
+        text, source = path.read_text(), str(path)
+    try:
+        data = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise SettingsError(f'{source} is not YAML: {error}') from None
+    if not isinstance(data, Mapping):
+        raise SettingsError(f'{source} must hold a mapping of settings, not {type(data).__name__}')
+    return parse(data, source)
+
+
+def from_canonical(text: str, source: str) -> Settings:
+    """Settings from the JSON of a `RunSpec`.
+
+    Raises:
+        SettingsError: not JSON, or a setting that is refused.
+    """
+    try:
+        data = json.loads(text)
+    except ValueError as error:
+        raise SettingsError(f'{source}: the settings are not JSON: {error}') from None
+    return parse(data, source)

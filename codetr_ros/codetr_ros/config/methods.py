@@ -1,0 +1,270 @@
+"""The settings of the reward methods and policy learners, a group for each."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from codetr_ros.config.base import Group
+
+Hidden = tuple[Annotated[int, Field(ge=1, le=65536)], ...]
+
+
+class CodetrSettings(Group):
+    """The reward transformer (the supplement's Table 1)."""
+
+    layers: int = Field(3, ge=1, le=24, description='causal transformer layers')
+    heads: int = Field(4, ge=1, le=64, description='attention heads of each causal layer')
+    embedding: int = Field(
+        256, ge=4, le=4096, description='embedding dimension d; divisible by heads'
+    )
+    dropout: float = Field(
+        0.1, ge=0, lt=1, description='dropout of embeddings, attention and residuals'
+    )
+    batch: int = Field(64, ge=1, le=65536, description='segments in a gradient step')
+    learning_rate: float = Field(5e-5, gt=0, le=1, description='AdamW learning rate')
+    weight_decay: float = Field(1e-4, ge=0, le=1, description='AdamW weight decay')
+    warmup_gradient_steps: int = Field(
+        100, ge=0, le=10**7, description='gradient steps of linear learning-rate warm-up'
+    )
+    schedule: Literal['constant', 'cosine'] = Field(
+        'cosine',
+        description='learning rate after its warm-up (decided here; not in the supplement)',
+    )
+    total_gradient_steps: int = Field(
+        10_000,
+        ge=1,
+        le=10**9,
+        description='gradient steps after which the cosine schedule has decayed to a tenth',
+    )
+    first_gradient_steps: int = Field(
+        100, ge=0, le=10**6, description='gradient steps after the last warm-up phase'
+    )
+    gradient_steps: int = Field(
+        10, ge=0, le=10**6, description='gradient steps after every later phase'
+    )
+    tokens: Literal['pair', 'merged'] = Field(
+        'pair',
+        description='pair: a state and an action token per step, as the paper; merged: one, '
+        'twice as fast',
+    )
+    head_scale: Literal['inverse', 'inverse_sqrt', 'one'] = Field(
+        'inverse_sqrt',
+        description='factor on the in-sequence logits: 1/d, 1/sqrt(d) (decided here) '
+        'or 1 (published code)',
+    )
+    initialisation: Literal['gpt2', 'lecun'] = Field(
+        'gpt2',
+        description='initial weights: small, nearly one step at a time, as GPT-2 (decided here), '
+        'or of variance 1/inputs',
+    )
+    weights: Literal['attention', 'one'] = Field(
+        'attention',
+        description='w_t: column sums of the in-sequence attention, or fixed to 1 (an ablation)',
+    )
+    attention_scope: Literal['segment', 'window'] = Field(
+        'segment',
+        description='in-sequence attention sees the segment only, or the context before it as '
+        'well',
+    )
+    context: Literal['segment', 'episode'] = Field(
+        'segment',
+        description='the causal transformer starts at the segment, or up to `window` steps '
+        'before it',
+    )
+    label: Literal['product', 'rhat'] = Field(
+        'product',
+        description='the step reward: w_t * rhat_t, whose sum is the prediction, or rhat_t',
+    )
+    labelling: Literal['segment', 'window'] = Field(
+        'segment',
+        description='label whole segments in one pass, or each step from the `window` steps '
+        'that end with it',
+    )
+    window: int = Field(100, ge=1, le=10_000, description='prediction window H [steps]')
+    normalise_observations: bool = Field(
+        True, description='standardise observations by warm-up mean and deviation (decided here)'
+    )
+    label_batch: int = Field(
+        256,
+        ge=1,
+        le=65536,
+        description='segments or windows labelled between two looks at arriving messages; a GPU '
+        'wants thousands',
+    )
+    precision: Literal['float32', 'bfloat16'] = Field(
+        'float32',
+        description="of the causal layers' products; weights and heads are float32 in any case. "
+        'bfloat16 rounds to 8 bits, and is faster for large networks where the processor has it '
+        '(avx512_bf16, amx)',
+    )
+
+    @model_validator(mode='after')
+    def _heads_divide_embedding(self) -> 'CodetrSettings':
+        if self.embedding % self.heads:
+            raise ValueError(f'embedding={self.embedding} is not divisible by heads={self.heads}')
+        return self
+
+
+class RbtSettings(Group):
+    """What RBT has beyond the transformer, whose settings it shares with CoDeTr (`codetr`).
+
+    Of those, `weights`, `label`, `context` and `attention_scope` are CoDeTr's alone.
+    """
+
+    state_loss_weight: float = Field(
+        1.0, ge=0, le=1000, description='weight of the loss on the predicted next observation'
+    )
+    attention_scope: Literal['segment', 'window'] = Field(
+        'window',
+        description='attention sees the segments that fit into `codetr.window` steps (two at '
+        'least), as published, or one only',
+    )
+
+
+class PerceptronSettings(Group):
+    """A reward model that sees one step at a time."""
+
+    hidden: Hidden = Field(
+        (256, 256), min_length=1, max_length=8, description='hidden layer widths of the reward net'
+    )
+    learning_rate: float = Field(3e-4, gt=0, le=1, description='AdamW learning rate')
+    weight_decay: float = Field(
+        0.0, ge=0, le=1, description='AdamW weight decay; 0 makes it plain Adam'
+    )
+    first_gradient_steps: int = Field(
+        100, ge=0, le=10**6, description='gradient steps after the last warm-up phase'
+    )
+    gradient_steps: int = Field(
+        10, ge=0, le=10**6, description='gradient steps after every later phase'
+    )
+    normalise_observations: bool = Field(
+        True, description='standardise observations by warm-up mean and deviation (decided here)'
+    )
+
+
+class MlpSettings(PerceptronSettings):
+    """The Markovian control: trained on segments as the transformer is."""
+
+    batch: int = Field(64, ge=1, le=65536, description='segments in a gradient step')
+
+
+class RrdSettings(PerceptronSettings):
+    """Randomized return decomposition (Ren et al., arXiv 2111.13485)."""
+
+    loss: Literal['biased', 'unbiased'] = Field(
+        'biased',
+        description='the published default, or less the variance that the drawing of steps adds',
+    )
+    subsequences: int = Field(
+        4, ge=1, le=65536, description='segments in a gradient step, drawn by their lengths'
+    )
+    subsequence_steps: int = Field(
+        64, ge=2, le=65536, description='steps K drawn from each segment'
+    )
+    first_gradient_steps: int = Field(
+        1000, ge=0, le=10**6, description='gradient steps after the last warm-up phase'
+    )
+    gradient_steps: int = Field(
+        1000,
+        ge=0,
+        le=10**6,
+        description='gradient steps after every later phase; published: one for each SAC update',
+    )
+
+
+class SacSettings(Group):
+    """Soft actor-critic as jaxrl has it."""
+
+    hidden: Hidden = Field(
+        (256, 256), min_length=1, max_length=8, description='hidden layer widths'
+    )
+    batch: int = Field(256, ge=1, le=65536, description='steps in an update')
+    actor_learning_rate: float = Field(
+        3e-4, gt=0, le=1, description='Adam learning rate of the actor'
+    )
+    critic_learning_rate: float = Field(
+        3e-4, gt=0, le=1, description='Adam learning rate of the critics'
+    )
+    temperature_learning_rate: float = Field(
+        3e-4, gt=0, le=1, description='Adam learning rate of the temperature'
+    )
+    discount: float = Field(0.99, ge=0, le=1, description='discount factor gamma')
+    tau: float = Field(0.005, gt=0, le=1, description='Polyak step of the target critics')
+    initial_temperature: float = Field(
+        1.0, gt=0, le=1000, description='entropy temperature at the start'
+    )
+    target_entropy: float = Field(
+        -0.5,
+        ge=-10,
+        le=10,
+        description='target entropy in units of the action size: -0.5 as jaxrl, often -1 '
+        'elsewhere',
+    )
+    updates_per_step: float = Field(1.0, ge=0, le=100, description='updates per environment step')
+    burst: int = Field(
+        50, ge=1, le=100_000, description='updates between two looks at arriving messages'
+    )
+    compile: bool = Field(
+        True,
+        description='compile the update for this processor, or the GPU of `device`: faster, but '
+        'needs a C++ compiler, and the first start takes about half a minute more, later ones '
+        'some seconds (what was compiled is kept in ~/.cache/codetr_ros/torch)',
+    )
+
+
+class HcSettings(Group):
+    """The critic of method `hc` (Han et al., arXiv 2106.11854); the rest of it is `sac`'s."""
+
+    history: Literal['singleton', 'recurrent'] = Field(
+        'recurrent',
+        description='value of the history: a sum over its steps, or of a GRU that reads it',
+    )
+    regulariser: float = Field(
+        5.0,
+        ge=0,
+        le=1e6,
+        description="weight of (H(whole segment) - score)^2 in the critics' loss; 0: none",
+    )
+    width: int = Field(128, ge=1, le=65536, description='width of the GRU')
+    segments: int = Field(
+        16,
+        ge=1,
+        le=65536,
+        description='segments from which the sac.batch steps of an update are drawn '
+        '(decided here)',
+    )
+
+
+class LirpgSettings(Group):
+    """PPO with a learnt intrinsic reward (Zheng et al., arXiv 1804.06459); its constants."""
+
+    hidden: Hidden = Field(
+        (64, 64), min_length=1, max_length=8, description='hidden layer widths of all networks'
+    )
+    learning_rate: float = Field(
+        3e-4, gt=0, le=1, description='Adam learning rate of the policy and its value'
+    )
+    reward_learning_rate: float = Field(
+        1e-4,
+        gt=0,
+        le=1,
+        description='Adam learning rate of the intrinsic reward and the value of scores',
+    )
+    epsilon: float = Field(1e-5, gt=0, le=1, description="Adam's epsilon")
+    epochs: int = Field(10, ge=1, le=1000, description='passes over the steps of a phase')
+    batch: int = Field(64, ge=2, le=65536, description='steps in an update')
+    clip: float = Field(0.2, gt=0, le=1, description="clip range of PPO's probability ratio")
+    discount: float = Field(0.99, ge=0, le=1, description='discount factor gamma')
+    trace_decay: float = Field(
+        0.95, ge=0, le=1, description='lambda of the generalised advantage estimation'
+    )
+    intrinsic_coefficient: float = Field(
+        1.0, ge=0, le=1e6, description='weight of the intrinsic reward in what the policy learns'
+    )
+    extrinsic_coefficient: float = Field(
+        0.0, ge=0, le=1e6, description='weight of the scores in what the policy learns'
+    )
+    value_coefficient: float = Field(0.5, ge=0, le=1e6, description='weight of the value losses')
+    gradient_norm: float = Field(
+        0.5, gt=0, le=1e6, description='gradients are shortened to this norm'
+    )

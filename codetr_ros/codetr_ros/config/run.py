@@ -1,0 +1,331 @@
+"""The one configuration of a run: typed, validated, and the origin of CLI flags, YAML keys and ROS
+parameters.
+
+The defaults are the paper's (its supplement's Table 1 and A.2; where that is silent, the decision
+is marked "decided here"). Presets change some of them: `quick`, `cpu` and `paper` are the YAML
+files of `presets/`.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from pydantic import Field, model_validator
+
+from codetr_ros.config.base import Group, SettingsError, flatten, validate
+from codetr_ros.config.methods import (
+    CodetrSettings,
+    HcSettings,
+    LirpgSettings,
+    MlpSettings,
+    RbtSettings,
+    RrdSettings,
+    SacSettings,
+)
+from codetr_ros.records import PROTOCOL_VERSION, RunSpec
+
+Composite = Literal[
+    'sum', 'sum_square', 'square_sum', 'max', 'max_hard', 'max_log_sum_exp', 'max_times_n'
+]
+
+
+Method = Literal[
+    'codetr', 'none', 'rbt', 'rrd', 'ircr', 'hc', 'lirpg', 'mlp', 'uniform', 'true', 'ones'
+]
+
+
+IN_PROCESS_ONLY = {
+    'true': 'is a reference that looks at what no node may see',
+    'ones': 'is a reference that ignores the scores',
+    'lirpg': 'learns on-policy, each phase from its own steps alone',
+}
+"""Methods that run without nodes only, and what keeps them from it."""
+
+
+SCORE_LEARNERS: tuple[str, ...] = ('hc', 'lirpg')
+"""Methods whose policy learner learns from the composite rewards themselves: no reward node labels
+steps for it."""
+
+
+class Settings(Group):
+    """Everything that the nodes of a run must agree on."""
+
+    task: str = Field(
+        'Ant-v4', min_length=1, description='task: a name of `codetr tasks` or any Gymnasium id'
+    )
+    composite: Composite = Field(
+        'sum', description="how a segment's rewards make its composite reward"
+    )
+    beta: float = Field(3.0, gt=0, le=1000, description='inverse temperature of the soft maximum')
+    delay: int = Field(
+        25,
+        ge=1,
+        le=100_000,
+        description='steps n of a segment: one composite reward comes for each',
+    )
+    method: Method = Field(
+        'codetr', description='how step rewards are made from composite rewards'
+    )
+    steps: int = Field(1_000_000, ge=1, le=10**9, description='environment steps of the run')
+    seed: int = Field(0, ge=0, le=2**31 - 1, description='seed of everything random')
+    phase_steps: int = Field(1000, ge=1, le=10**6, description='environment steps of a phase')
+    warmup_steps: int = Field(
+        10_000,
+        ge=1,
+        le=10**8,
+        description='uniformly random steps at the start, rounded up to whole phases',
+    )
+    overlap: bool = Field(
+        False,
+        description='simulate phase k under what phase k-2 taught, while phase k-1 is learnt from',
+    )
+    simulators: int = Field(
+        1, ge=1, le=64, description='simulators among whom the steps of a phase are divided'
+    )
+    envs: int = Field(
+        1,
+        ge=1,
+        le=64,
+        description='environments of each simulator, among which its steps are divided; they are '
+        'stepped in threads, as many as there are processors, where that is faster',
+    )
+    memory_steps: int = Field(
+        1_000_000, ge=1, le=10**9, description='steps that the memory D holds'
+    )
+    evaluate_every: int = Field(
+        5000, ge=0, le=10**9, description='steps between evaluations; 0: none'
+    )
+    evaluate_episodes: int = Field(10, ge=1, le=10_000, description='episodes of an evaluation')
+    r_max: float | None = Field(
+        None,
+        gt=0,
+        le=1e9,
+        description="largest reward of a step, for scores; the task's own where not given",
+    )
+    target_scale: Literal['rms', 'none'] = Field(
+        'rms',
+        description='unit c of composite rewards: root mean square per step of the warm-up '
+        '(decided here), or 1',
+    )
+    reward_unit: Literal['scaled', 'raw'] = Field(
+        'scaled',
+        description='step rewards that the learner sees: in units of c (decided here), or '
+        'unscaled',
+    )
+    relabel_steps: int = Field(
+        0,
+        ge=0,
+        le=10**9,
+        description='steps of the memory that are labelled again in a phase, whole segments with '
+        'the oldest labels first, one at least; what is new is always labelled; 0: all',
+    )
+    relabel: Literal['all', 'drawn'] = Field(
+        'all',
+        description='steps of the memory that are labelled again in a phase: all, or those that '
+        'the updates after it will draw, which is known beforehand: SAC sees the newest labels '
+        'either way. Worth its while with `codetr.labelling` window in a large memory; else whole '
+        'segments are labelled that hold such a step',
+    )
+    record_relabels: Literal['first', 'all'] = Field(
+        'first',
+        description='labels in the bag: the first of each segment and, at evaluations, all that '
+        'the phase gave, or every one',
+    )
+    threads: int = Field(1, ge=1, le=256, description='torch threads of each process')
+    device: str = Field(
+        'cpu',
+        pattern=r'^(cpu|cuda(:\d{1,2})?)$',
+        description='where SAC learns: cpu, or the GPU cuda, cuda:1, ... of the learner',
+    )
+    reward_device: str = Field(
+        'cpu',
+        pattern=r'^(cpu|cuda(:\d{1,2})?)$',
+        description='where a reward model with a network learns and labels: cpu, or the GPU cuda, '
+        'cuda:1, ... of the reward node; all else runs on the CPU',
+    )
+    codetr: CodetrSettings = Field(
+        default_factory=CodetrSettings, description='the reward transformer'
+    )
+    rbt: RbtSettings = Field(
+        default_factory=RbtSettings, description='RBT, beyond the reward transformer'
+    )
+    rrd: RrdSettings = Field(
+        default_factory=RrdSettings, description='randomized return decomposition'
+    )
+    mlp: MlpSettings = Field(
+        default_factory=MlpSettings, description='the reward model of single steps'
+    )
+    sac: SacSettings = Field(default_factory=SacSettings, description='the policy learner')
+    hc: HcSettings = Field(default_factory=HcSettings, description='the critic of method hc')
+    lirpg: LirpgSettings = Field(
+        default_factory=LirpgSettings, description='the policy learner of method lirpg'
+    )
+
+    @model_validator(mode='after')
+    def _on_policy_in_lock_step(self) -> 'Settings':
+        if self.method == 'lirpg' and self.overlap:
+            raise ValueError(
+                'overlap=True with method=lirpg: it learns on-policy, from steps under the very '
+                'policy that it changes; set overlap=False'
+            )
+        return self
+
+    @model_validator(mode='after')
+    def _a_gpu_has_a_use(self) -> 'Settings':
+        if self.device != 'cpu' and not self.labels_steps:
+            raise ValueError(
+                f'device={self.device} with method={self.method}: its policy learner runs on the '
+                'CPU only; set device=cpu'
+            )
+        return self
+
+    @model_validator(mode='after')
+    def _what_is_drawn_is_known(self) -> 'Settings':
+        if self.relabel == 'all':
+            return self
+        if not self.labels_steps:
+            raise ValueError(
+                f'relabel={self.relabel} with method={self.method}: its policy learner draws no '
+                'labelled steps; set relabel=all'
+            )
+        if self.device != 'cpu':
+            raise ValueError(
+                f'relabel={self.relabel} with device={self.device}: SAC draws there from a '
+                "generator of the device's own, and nobody else knows what; set device=cpu or "
+                'relabel=all'
+            )
+        if self.relabel_steps:
+            raise ValueError(
+                f'relabel={self.relabel} with relabel_steps={self.relabel_steps}: one labels '
+                'again all that will be drawn, the other so many of the oldest; set '
+                'relabel_steps=0 or relabel=all'
+            )
+        return self
+
+    @property
+    def labels_steps(self) -> bool:
+        """Whether a reward method labels steps, from which the policy is then learnt."""
+        return self.method not in SCORE_LEARNERS
+
+    @property
+    def roles(self) -> dict[str, int]:
+        """How many nodes of each role the run needs."""
+        needed = {
+            'sim': self.simulators,
+            'evaluate': int(self.evaluate_every > 0),
+            'reward': int(self.labels_steps),
+            'record': 1,
+            'learner': 1,
+        }
+        return {role: count for role, count in needed.items() if count}
+
+    @property
+    def phases(self) -> int:
+        """Phases of the run; the last may be shorter."""
+        return -(-self.steps // self.phase_steps)
+
+    @property
+    def warmup_phases(self) -> int:
+        """Phases under the random policy: a phase begun is ended so."""
+        return min(self.phases, -(-self.warmup_steps // self.phase_steps))
+
+    @property
+    def lag(self) -> int:
+        """Phases from what taught a policy to where it acts: 1 in lock-step, 2 with overlap."""
+        return 2 if self.overlap else 1
+
+    def steps_of(self, phase: int) -> int:
+        """Environment steps of a phase, all sources together; 0 beyond the last."""
+        return max(0, min(self.phase_steps, self.steps - phase * self.phase_steps))
+
+    def shares_of(self, phase: int) -> list[int]:
+        """Steps that each source takes of a phase: the first ones take one more where it does not
+        divide.
+        """
+        share, rest = divmod(self.steps_of(phase), self.source_count)
+        return [share + (i < rest) for i in range(self.source_count)]
+
+    def steps_after(self, version: int) -> int:
+        """Environment steps that policy version `version` has learnt from."""
+        return min(self.steps, (version + 1) * self.phase_steps)
+
+    @property
+    def relabels_all(self) -> bool:
+        """Whether each version of the reward model labels all of the memory."""
+        return self.relabel == 'all' and not self.relabel_steps
+
+    def evaluated(self, version: int) -> bool:
+        """Whether this policy version is evaluated: the last one, and the first past each
+        multiple.
+
+        Policies of the warm-up act at random and are not evaluated again: the random policy is,
+        once, at step 0.
+        """
+        if self.evaluate_every == 0 or version < self.warmup_phases - 1:
+            return False
+        if version == self.phases - 1:
+            return True
+        return (
+            self.steps_after(version) // self.evaluate_every
+            > self.steps_after(version - 1) // self.evaluate_every
+        )
+
+    def canonical(self) -> str:
+        """The settings as JSON, the same for the same settings on every machine."""
+        return json.dumps(self.model_dump(mode='json'), sort_keys=True, separators=(',', ':'))
+
+    def hash(self) -> str:
+        """sha256 of `canonical`."""
+        return hashlib.sha256(self.canonical().encode()).hexdigest()
+
+    def run_spec(self, run_id: str) -> RunSpec:
+        """The record that says what run this is."""
+        return RunSpec(run_id, PROTOCOL_VERSION, self.seed, self.canonical(), self.hash())
+
+    @property
+    def simulator_names(self) -> tuple[str, ...]:
+        """Names that `codetr train` gives the run's simulators: sim, sim_2, sim_3, ..."""
+        return ('sim', *(f'sim_{i}' for i in range(2, self.simulators + 1)))
+
+    @property
+    def source_count(self) -> int:
+        """Sources of the run: environments of all simulators."""
+        return self.simulators * self.envs
+
+    def sources_of(self, simulator: str) -> tuple[str, ...]:
+        """Names of a simulator's sources: its own where it has one environment; sim-1, sim-2, ...
+        where it has several.
+        """
+        if self.envs == 1:
+            return (simulator,)
+        return tuple(f'{simulator}-{i}' for i in range(1, self.envs + 1))
+
+    def simulator_of(self, source: str) -> str:
+        """The simulator whose source it is. No node's name has a hyphen."""
+        return source if self.envs == 1 else source.rpartition('-')[0]
+
+    def flat(self) -> dict[str, Any]:
+        """Every setting by its dotted name, as ROS parameters and errors call it."""
+        return dict(flatten(self.model_dump()))
+
+    def changed(self, changes: Mapping[str, Any], source: str = 'change') -> 'Settings':
+        """A copy with some settings changed, given by dotted name.
+
+        Raises:
+            SettingsError: a name is unknown or a value is not allowed; `source` says where it came
+                from.
+        """
+        data = self.model_dump()
+        for name, value in changes.items():
+            *groups, last = name.split('.')
+            place = data
+            for group in groups:
+                place = place.get(group, {}) if isinstance(place, dict) else {}
+            if not isinstance(place, dict) or last not in place:
+                raise SettingsError(
+                    f'{source}: there is no setting {name!r} (value {value!r}). Settings are: '
+                    f'{", ".join(self.flat())}'
+                )
+            place[last] = value
+        return validate(Settings, data, source)

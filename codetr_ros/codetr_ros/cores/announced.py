@@ -1,0 +1,108 @@
+"""The sources of a run, as they have announced themselves, and what they simulate."""
+
+import logging
+from collections import Counter
+from collections.abc import Callable
+
+from codetr_ros.config import Settings
+from codetr_ros.records import (
+    PROTOCOL_VERSION,
+    TOPICS,
+    RecordError,
+    RunSpec,
+    TaskSpec,
+    Transitions,
+    describe,
+)
+from codetr_ros.records.checks import check_run, check_transitions
+
+_log = logging.getLogger(__name__)
+
+
+class Tasks:
+    """The sources of a run and what they simulate."""
+
+    def __init__(self, run: RunSpec, settings: Settings) -> None:
+        self._run = run
+        self._settings = settings
+        self.specs: dict[str, TaskSpec] = {}
+        self._unannounced: list[Transitions] = []
+        self.refused: Counter[str] = Counter()  # of what waited for its announcement
+
+    @property
+    def known(self) -> bool:
+        """Whether all sources of the run have said what they simulate."""
+        return len(self.specs) == self._settings.source_count
+
+    @property
+    def first(self) -> TaskSpec:
+        """The task, which all sources share."""
+        return self.specs[min(self.specs)]
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Names of the sources, sorted."""
+        return tuple(sorted(self.specs))
+
+    def receive(self, spec: TaskSpec) -> None:
+        """Take what a simulator says it simulates.
+
+        Raises:
+            RecordError: another run, protocol, task, size, or a simulator too many.
+        """
+        check_run(spec, self._run)
+        if spec.protocol_version != PROTOCOL_VERSION:
+            raise RecordError(
+                f'{spec.source!r} speaks protocol {spec.protocol_version}, this node '
+                f'{PROTOCOL_VERSION}: install the same '
+                f'version of codetr_ros on both'
+            )
+        for known in self.specs.values():
+            for name in ('task', 'observation_size', 'action_size', 'horizon', 'r_max'):
+                if getattr(known, name) != getattr(spec, name):
+                    raise RecordError(
+                        f'{spec.source!r} has {name}={getattr(spec, name)!r}, {known.source!r} '
+                        'has '
+                        f'{getattr(known, name)!r}: all simulators of a run must simulate the '
+                        'same task'
+                    )
+        if spec.source not in self.specs and self.known:
+            raise RecordError(
+                f'{spec.source!r} is one simulator too many: the run has '
+                f'simulators={self._settings.simulators} with envs={self._settings.envs} each '
+                f'({", ".join(self.sources)}). Start the run with more, or stop this one'
+            )
+        self.specs[spec.source] = spec
+
+    def announce(self, spec: TaskSpec, receive: Callable[[Transitions], None]) -> None:
+        """Take an announcement, then hand what waited for it to `receive`.
+
+        Raises:
+            RecordError: as `receive` of this class; what waited is then still waiting.
+        """
+        self.receive(spec)
+        waiting, self._unannounced = self._unannounced, []
+        for chunk in waiting:
+            try:
+                receive(chunk)
+            except RecordError as error:  # its fault, not that of the announcement
+                self.refused[TOPICS[Transitions]] += 1
+                _log.error('%s', error)
+
+    def admit(self, chunk: Transitions) -> bool:
+        """Whether steps may be taken in now; those that came before their announcement wait.
+
+        Raises:
+            RecordError: they are of no simulator of this run, or the task cannot have them.
+        """
+        spec = self.specs.get(chunk.source)
+        if spec is not None:
+            check_transitions(chunk, spec)
+            return True
+        if self.known:
+            raise RecordError(
+                f'{describe(chunk)}: {chunk.source!r} is no simulator of this run; these are: '
+                f'{", ".join(self.sources)}'
+            )
+        self._unannounced.append(chunk)  # announcements travel on another topic
+        return False

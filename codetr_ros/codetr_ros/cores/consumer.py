@@ -1,0 +1,146 @@
+"""What learner and reward side have in common: a memory fed by commits, checkpoints, a report."""
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+
+from codetr_ros import records
+from codetr_ros.config import Settings
+from codetr_ros.cores.intake import Intake
+from codetr_ros.memory.trajectories import Trajectories
+from codetr_ros.records import Metrics, Record, RunSpec
+from codetr_ros.runs import checkpoints
+
+
+class Consumer(ABC):
+    """A core that takes phases into its memory D, in order, and learns from each.
+
+    Args:
+        run: the run.
+        settings: its settings.
+        name: node name.
+        folder: where checkpoints go; None keeps none.
+        scores: whether composite rewards are taken in.
+        true_rewards: whether the environment's own rewards are: the in-process oracle only.
+    """
+
+    role: ClassVar[str]
+
+    def __init__(
+        self,
+        run: RunSpec,
+        settings: Settings,
+        name: str,
+        folder: Path | None,
+        scores: bool,
+        true_rewards: bool = False,
+    ) -> None:
+        self._run = run
+        self._settings = settings
+        self._name = name
+        self._folder = folder
+        self._true_rewards = true_rewards
+        self._intake = Intake(run, settings, scores, true_rewards)
+        self._memory: Trajectories | None = None
+        self._phase = 0  # the next to be learnt from
+        self._saved = -1
+        self._counters: Counter[str] = Counter()
+        self.duplicated = self._intake.duplicated
+        self.finished = False
+
+    @property
+    def refused(self) -> 'Counter[str]':
+        """Records left out of a committed phase, by topic."""
+        return self._intake.refused
+
+    @property
+    def missing(self) -> int | None:
+        """A committed phase of which something has not arrived."""
+        return self._intake.missing
+
+    def receive(self, record: Record) -> None:
+        """Hold a record until its phase's turn.
+
+        Raises:
+            RecordError: it must not be taken in; nothing has changed.
+        """
+        self._intake.receive(record)
+
+    def work(self) -> Iterator[list[Record] | None]:
+        """Algorithm 1 as this side sees it; one slice per `next()`."""
+        while not self._intake.tasks.known:
+            yield None
+        spec, settings = self._intake.tasks.first, self._settings
+        self._memory = Trajectories(
+            spec.observation_size,
+            spec.action_size,
+            settings.delay,
+            settings.memory_steps,
+            settings.phase_steps + spec.horizon,
+            self._true_rewards,
+        )
+        yield from self._begin()
+        for phase in range(settings.phases):
+            while not self._intake.take(phase, self._memory):
+                yield None
+            # the warm-up's phases are kept, and learnt from at its end
+            learns = phase >= settings.warmup_phases - 1
+            yield from self._learn(phase, self._memory, learns)
+            if learns:
+                self.close()
+                yield []
+        self.finished = True
+        while True:
+            yield None
+
+    @abstractmethod
+    def _begin(self) -> Iterator[list[Record]]:
+        """Make what is trained, now that sizes are known; what to say before the first phase."""
+
+    @abstractmethod
+    def _learn(
+        self, phase: int, memory: Trajectories, learns: bool
+    ) -> Iterator[list[Record] | None]:
+        """What follows on a phase that was taken in; sets `_phase` before its last word."""
+
+    @abstractmethod
+    def _state(self) -> dict[str, torch.Tensor]:
+        """What a checkpoint holds."""
+
+    def _metrics(self, phase: int, values: Mapping[str, float]) -> Metrics:
+        step = self._settings.steps_after(phase)
+        return records.metrics(self._run.run_id, self.role, self._name, phase, step, values)
+
+    def close(self) -> None:
+        """Save a checkpoint of the last finished phase, unless there is one or no folder."""
+        done = self._phase - 1
+        if self._folder is None or self._memory is None or self._saved == done:
+            return
+        if done < self._settings.warmup_phases - 1:
+            return  # nothing has been learnt
+        spec = self._intake.tasks.first
+        meta = {
+            'run_id': self._run.run_id,
+            'settings': self._run.settings,
+            'task': spec.task,
+            'observation_size': spec.observation_size,
+            'action_size': spec.action_size,
+            'phase': done,
+        }
+        checkpoints.save(self._folder, self.role, done, self._state(), meta)
+        self._saved = done
+
+    def report(self) -> dict[str, Any]:
+        """Counts for the run's summary."""
+        said: dict[str, Any] = {
+            'duplicated': dict(self.duplicated),
+            'refused': dict(self.refused),
+            'counters': dict(self._counters),
+        }
+        if self._memory is not None:
+            said['memory'] = self._memory.report()
+        return said

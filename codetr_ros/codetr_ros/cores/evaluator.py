@@ -1,0 +1,107 @@
+"""The evaluator: how good the policies are, without noise, beside the run and never in its way."""
+
+from collections import Counter, deque
+from collections.abc import Iterator
+from typing import Any
+
+from codetr_ros.config import Settings
+from codetr_ros.policy.acting import ActingPolicy, uniform_actions
+from codetr_ros.records import INITIAL_VERSION, EpisodeResult, Policy, Record, RunSpec
+from codetr_ros.seeding import generator
+from codetr_ros.simulation.episode import Episode
+from codetr_ros.simulation.permission import acting_policy, check_policy
+from codetr_ros.simulation.tasks import make
+
+
+class Evaluator:
+    """Evaluates policy versions: `evaluate_episodes` episodes each, with deterministic actions.
+
+    Every evaluation of a run begins its episodes in the same start states. The first is that of
+    the uniformly random policy, from which everything starts. With `evaluate_every` = 0 there is
+    none at all.
+
+    Args:
+        run: the run it belongs to.
+        settings: the settings of the run.
+        name: its name, the source of its results.
+
+    Raises:
+        TaskError: the task is unknown or cannot be used.
+        SettingsError: the delay exceeds the task's horizon.
+    """
+
+    subscribes: tuple[type, ...] = (Policy,)
+
+    def __init__(self, run: RunSpec, settings: Settings, name: str) -> None:
+        self._run = run
+        self._settings = settings
+        self._name = name
+        self._environment = make(settings.task)
+        self._episode = Episode(self._environment, settings)
+        self._waiting: deque[tuple[str, int, ActingPolicy | None]] = (
+            deque()
+        )  # purpose, version, policy
+        self._seen: set[int] = set()  # versions that are evaluated or wait for it
+        self._counters: Counter[str] = Counter()
+        self._closed = False
+        self.finished = False
+
+    def receive(self, record: Record) -> None:
+        """Keep a policy whose version is due for evaluation.
+
+        Raises:
+            RecordError: it is of another run, or its weights do not fit. Nothing has changed.
+        """
+        settings = self._settings
+        policy = check_policy(record, self._run, settings, f'evaluator {self._name!r}')
+        if settings.evaluate_every == 0:
+            self.finished = self.finished or policy.version == settings.phases - 1
+            return
+        if policy.random and policy.phase == 0 and INITIAL_VERSION not in self._seen:
+            self._seen.add(INITIAL_VERSION)
+            self._waiting.append(('random', INITIAL_VERSION, None))
+        if settings.evaluated(policy.version) and policy.version not in self._seen:
+            acting = acting_policy(policy, self._environment, settings.delay)
+            self._seen.add(policy.version)
+            self._waiting.append(('evaluation', policy.version, acting))
+
+    def work(self) -> Iterator[list[Record] | None]:
+        """One episode per slice."""
+        while True:
+            if not self._waiting:
+                yield None
+                continue
+            purpose, version, acting = self._waiting.popleft()
+            for episode in range(self._settings.evaluate_episodes):
+                result = self._evaluate(purpose, version, acting, episode)
+                last = episode == self._settings.evaluate_episodes - 1
+                if last:
+                    self._counters['evaluations'] += 1
+                    self.finished = self.finished or version == self._settings.phases - 1
+                yield [result]
+
+    def _evaluate(
+        self, purpose: str, version: int, acting: ActingPolicy | None, number: int
+    ) -> EpisodeResult:
+        """One episode, from the start state that its number stands for."""
+        seed, episode, environment = self._settings.seed, self._episode, self._environment
+        episode.reset(int(generator(seed, 'evaluate', number).integers(2**31)))
+        if acting is None:
+            rng = generator(seed, 'evaluate', 'random', number)
+            actions = uniform_actions(rng, environment.horizon, environment.action_size)
+        while not episode.over:
+            t = episode.length
+            episode.step(actions[t] if acting is None else acting.act(episode.observation, step=t))
+        self._counters.update(episodes=1, steps=episode.length)
+        step = self._settings.steps_after(version)  # 0 for the initial version
+        return episode.result(self._run.run_id, self._name, purpose, step, version, number)
+
+    def close(self) -> None:
+        """Close the environment. An evaluator keeps no checkpoint."""
+        if not self._closed:
+            self._closed = True
+            self._environment.close()
+
+    def report(self) -> dict[str, Any]:
+        """Counts for the run's summary."""
+        return {'lost': {}, 'duplicated': {}, 'counters': dict(self._counters)}

@@ -1,0 +1,118 @@
+"""Algorithm 1 with plain calls instead of topics: the same cores, in the same order, in one
+process.
+
+With the same seed, pace and thread count a run over topics ends with the same weights as this one.
+Everything takes its turn here, so that evaluation, too, makes the run longer by the time that it
+takes; over topics no phase waits for it.
+"""
+
+import logging
+import resource
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from codetr_ros.config import Settings
+from codetr_ros.cores.core import Core
+from codetr_ros.cores.evaluator import Evaluator
+from codetr_ros.cores.labeller import Labeller
+from codetr_ros.cores.learner import Learner
+from codetr_ros.cores.recorder import Recorder
+from codetr_ros.cores.simulator import Simulator
+from codetr_ros.records import TOPICS, Record
+from codetr_ros.runs import folder as run_folder
+
+_log = logging.getLogger(__name__)
+
+
+def run(
+    settings: Settings,
+    run_id: str,
+    folder: Path | None = None,
+    observe: Callable[[Record], None] = lambda record: None,
+    tick: Callable[[], None] = lambda: None,
+) -> dict[str, dict[str, Any]]:
+    """Run Algorithm 1 to its end.
+
+    Args:
+        settings: the run's settings.
+        run_id: its name.
+        folder: where checkpoints and reports go; None keeps none.
+        observe: is handed every record, in order. What it raises ends the run, after a checkpoint.
+        tick: is called after every slice of work; the same holds for what it raises.
+
+    Returns:
+        A report for each part of the run, as the nodes write them.
+
+    Raises:
+        RuntimeError: every part waits for another: a fault of this program.
+    """
+    torch.set_num_threads(settings.threads)
+    spec = settings.run_spec(run_id)
+    checkpoints = folder / run_folder.CHECKPOINTS if folder else None
+    cores: dict[str, tuple[str, Core]] = {
+        name: ('sim', Simulator(spec, settings, name)) for name in settings.simulator_names
+    }
+    cores['record'] = ('record', Recorder(spec, settings, 'record'))
+    if settings.labels_steps:
+        cores['reward'] = ('reward', Labeller(spec, settings, 'reward', checkpoints))
+    cores['learner'] = ('learner', Learner(spec, settings, 'learner', checkpoints))
+    cores['evaluate'] = ('evaluate', Evaluator(spec, settings, 'evaluate'))
+    published: dict[str, Counter[str]] = {name: Counter() for name in cores}
+    received: dict[str, Counter[str]] = {name: Counter() for name in cores}
+    seconds = dict.fromkeys(cores, 0.0)
+    works = {name: core.work() for name, (_, core) in cores.items()}
+    observe(spec)
+    finished = False
+    try:
+        while not finished:
+            idle = True
+            for name, work in works.items():
+                began = time.perf_counter()
+                records = next(work)
+                seconds[name] += time.perf_counter() - began
+                tick()
+                if records is None:
+                    continue
+                idle = False
+                for record in records:
+                    topic = TOPICS[type(record)]
+                    published[name][topic] += 1
+                    for reader, (_, core) in cores.items():
+                        if type(record) in core.subscribes:
+                            received[reader][topic] += 1
+                            core.receive(record)
+                    observe(record)
+            finished = all(core.finished for _, core in cores.values())
+            if idle and not finished:
+                waiting = [name for name, (_, core) in cores.items() if not core.finished]
+                raise RuntimeError(
+                    f'every part of the run waits for another: {", ".join(waiting)} have not '
+                    'finished'
+                )
+    finally:
+        reports = {}
+        for name, (role, core) in cores.items():
+            core.close()
+            counts = {'published': dict(published[name]), 'received': dict(received[name])}
+            reports[name] = _report(role, name, core, seconds[name]) | counts
+            if folder is not None:
+                run_folder.write_report(folder, role, name, reports[name])
+    return reports
+
+
+def _report(role: str, name: str, core: Core, seconds: float) -> dict[str, Any]:
+    return {
+        'role': role,
+        'name': name,
+        'refused': {},
+        'peak_rss_mb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        'cpu_s': seconds,
+        'wall_s': seconds,
+        'finished': core.finished,
+        'error': None,
+    } | core.report()

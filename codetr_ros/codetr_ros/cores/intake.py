@@ -1,0 +1,158 @@
+"""What both consumers do with arriving records: check them once, hold what came early, give out
+what a commit names.
+"""
+
+import logging
+from collections import Counter
+from typing import Any
+
+from codetr_ros.config import Settings
+from codetr_ros.cores.announced import Tasks
+from codetr_ros.memory.trajectories import Trajectories
+from codetr_ros.records import (
+    TOPICS,
+    Commit,
+    CompositeReward,
+    Record,
+    RecordError,
+    RunSpec,
+    TaskSpec,
+    Transitions,
+    TrueRewards,
+    describe,
+)
+from codetr_ros.records.checks import check_run, check_score
+
+_log = logging.getLogger(__name__)
+
+
+class Intake:
+    """Holds what arrived until a commit says to which phase it belongs, then adds it to the memory
+    in order.
+
+    Args:
+        run: the run to which everything must belong.
+        settings: its settings.
+        scores: whether composite rewards are taken in too.
+        true_rewards: whether the environment's own rewards are: the in-process oracle only.
+    """
+
+    def __init__(
+        self, run: RunSpec, settings: Settings, scores: bool, true_rewards: bool = False
+    ) -> None:
+        self._run = run
+        self._settings = settings
+        self._scores = scores
+        self._true_rewards = true_rewards
+        self.tasks = Tasks(run, settings)
+        self._transitions: dict[tuple[str, int], Transitions] = {}
+        self._rewards: dict[tuple[str, int], CompositeReward] = {}
+        self._true: dict[tuple[str, int], TrueRewards] = {}
+        self._commits: dict[int, Commit] = {}
+        self._taken = {
+            'transitions': Counter[str](),
+            'scores': Counter[str](),
+        }  # next sequence number due
+        self.duplicated: Counter[str] = Counter()
+        self.refused = self.tasks.refused
+        self.missing: int | None = None  # a committed phase of which something has not arrived
+
+    def receive(self, record: Record) -> None:
+        """Check a record and hold it.
+
+        Raises:
+            RecordError: it must not be taken in; nothing has changed.
+        """
+        check_run(record, self._run)
+        if isinstance(record, TaskSpec):
+            self.tasks.announce(record, self.receive)
+        elif isinstance(record, Transitions):
+            if self.tasks.admit(record):
+                key = (record.source, record.sequence)
+                self._hold(record, self._transitions, key, self._taken['transitions'])
+        elif isinstance(record, CompositeReward):
+            check_score(record, self._settings.delay)
+            self._hold(
+                record, self._rewards, (record.scorer, record.sequence), self._taken['scores']
+            )
+        elif isinstance(record, TrueRewards):
+            self._true[record.source, record.sequence] = record
+        elif isinstance(record, Commit):
+            self._commits.setdefault(record.phase, record)
+
+    def _hold(
+        self,
+        record: Any,
+        held: dict[tuple[str, int], Any],
+        key: tuple[str, int],
+        taken: 'Counter[str]',
+    ) -> None:
+        ahead = (self._settings.lag + 1) * self._settings.phase_steps
+        if key[1] >= taken[key[0]] + ahead:
+            raise RecordError(
+                f'{describe(record)} is out of sequence: the permitted phases hold fewer than '
+                f'{ahead} records, and {taken[key[0]]} is the next of {key[0]!r} to be taken in'
+            )
+        if key in held or key[1] < taken[key[0]]:
+            self.duplicated[TOPICS[type(record)]] += 1
+        else:
+            held[key] = record
+
+    def take(self, phase: int, memory: Trajectories) -> bool:
+        """Add everything that the phase's commit names to the memory, ordered by source and
+        number.
+
+        Returns:
+            Whether it was all there. If not, nothing was added, and `missing` is the phase where
+            its commit is known.
+
+        Raises:
+            RecordError: what is committed contradicts itself: the run cannot go on.
+        """
+        commit = self._commits.get(phase)
+        if commit is None:
+            return False
+        chunks = self._named(commit.sources, commit.transitions, self._transitions, 'transitions')
+        scores = (
+            self._named(commit.scorers, commit.scores, self._rewards, 'scores')
+            if self._scores
+            else []
+        )
+        true = [(c.source, c.sequence) for c in chunks or () if self._true_rewards]
+        if chunks is None or scores is None or any(key not in self._true for key in true):
+            self.missing = phase
+            return False
+        self.missing = None
+        del self._commits[phase]
+        for chunk in chunks:
+            memory.append(self._transitions.pop((chunk.source, chunk.sequence)))
+        for key in true:
+            memory.append_true_rewards(self._true.pop(key))
+        for reward in scores:
+            del self._rewards[reward.scorer, reward.sequence]
+            try:
+                memory.score(reward)
+            except (
+                RecordError
+            ) as error:  # a wrong score spoils no run: it is said, counted, and left out
+                self.refused[TOPICS[CompositeReward]] += 1
+                _log.error('%s', error)
+        for names, last, kind in (
+            (commit.sources, commit.transitions, 'transitions'),
+            (commit.scorers, commit.scores, 'scores'),
+        ):
+            for name, number in zip(names, last.tolist(), strict=True):
+                self._taken[kind][name] = number + 1
+        memory.evict()
+        return True
+
+    def _named(
+        self, names: tuple[str, ...], last: Any, held: dict[tuple[str, int], Any], kind: str
+    ) -> list[Any] | None:
+        found = []
+        for name, number in sorted(zip(names, last.tolist(), strict=True)):
+            for sequence in range(self._taken[kind][name], number + 1):
+                if (name, sequence) not in held:
+                    return None
+                found.append(held[name, sequence])
+        return found

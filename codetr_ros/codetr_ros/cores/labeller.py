@@ -1,0 +1,289 @@
+"""The reward side's part of Algorithm 1: take a phase in, fit, label, say what changed."""
+
+import time
+from collections import Counter
+from collections.abc import Generator, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from codetr_ros.config import Settings
+from codetr_ros.cores.consumer import Consumer
+from codetr_ros.memory import due
+from codetr_ros.memory.trajectories import Trajectories
+from codetr_ros.records import (
+    F32,
+    I64,
+    Commit,
+    CompositeReward,
+    Record,
+    RunSpec,
+    StepRewards,
+    TaskSpec,
+    Transitions,
+    TrueRewards,
+)
+from codetr_ros.rewards import registry, saved
+from codetr_ros.rewards.base import RewardMethod, RewardModelError
+from codetr_ros.runs import checkpoints
+from codetr_ros.seeding import generator, seed_torch
+
+PART_BYTES = 200_000
+"""Upper bound of a part's arrays: well inside the 512 KB segment of Fast DDS' shared memory."""
+
+
+class Labeller(Consumer):
+    """Infers step rewards from composite rewards, phase by phase.
+
+    Args:
+        run: the run.
+        settings: its settings.
+        name: node name.
+        folder: where checkpoints go; None keeps none.
+        checkpoint: a saved reward model to start from (`saved.read`); empty: a new one.
+        frozen: only label, as the checkpoint has it; else it goes on learning.
+
+    Raises:
+        CheckpointError: there is no such checkpoint, or it is damaged.
+        RewardModelError: `frozen` without a checkpoint.
+    """
+
+    role = 'reward'
+    subscribes: tuple[type, ...] = (TaskSpec, Transitions, CompositeReward, Commit)
+
+    def __init__(
+        self,
+        run: RunSpec,
+        settings: Settings,
+        name: str,
+        folder: Path | None,
+        checkpoint: str = '',
+        frozen: bool = False,
+    ) -> None:
+        if frozen and not checkpoint:
+            raise RewardModelError(
+                'frozen = true without a checkpoint: a model that has learnt nothing would label '
+                'and never learn. Give the checkpoint of a fit or a run, or leave frozen out'
+            )
+        self._start = saved.read(Path(checkpoint)) if checkpoint else None
+        self._frozen = frozen
+        oracle = registry.kind(settings).needs_true_rewards
+        if oracle:
+            self.subscribes = (*self.subscribes, TrueRewards)
+        super().__init__(run, settings, name, folder, scores=True, true_rewards=oracle)
+        self._method: RewardMethod | None = None
+        self._fitted = False
+
+    @property
+    def method(self) -> RewardMethod | None:
+        """The reward method, once the task's sizes are known."""
+        return self._method
+
+    def _begin(self) -> Iterator[list[Record]]:
+        spec = self._intake.tasks.first
+        sizes = spec.observation_size, spec.action_size
+        self._method = (
+            registry.make(self._settings, *sizes)
+            if self._start is None
+            else saved.restore(self._start, self._settings, *sizes)
+        )
+        yield []
+
+    def _learn(
+        self, phase: int, memory: Trajectories, learns: bool
+    ) -> Iterator[list[Record] | None]:
+        method = self._method
+        assert method is not None
+        if not learns:
+            self._phase = phase + 1
+            # said of every phase: who plays a recorded run waits for it
+            yield [self._metrics(phase, {'gradient_steps': method.gradient_steps})]
+            return
+        if len(memory.segment_ids()) and not self._frozen:
+            method.prepare(memory)
+        metrics: dict[str, float] = {}
+        for said in self._fit(phase, memory, method):
+            metrics |= said
+            yield []
+        began = time.perf_counter()
+        parts: list[StepRewards] = []
+        for batch in self._label(phase, memory, method):
+            parts += batch
+            yield []
+        metrics |= due.metrics(memory, method.version)
+        metrics |= {
+            'steps_labelled': sum(len(part.labels) for part in parts),
+            'target_scale': method.target_scale,
+            'gradient_steps': method.gradient_steps,
+            'label_seconds': time.perf_counter() - began,
+        }
+        self._phase = phase + 1
+        yield [*self._numbered(phase, method.version, parts), self._metrics(phase, metrics)]
+
+    def _fit(
+        self, phase: int, memory: Trajectories, method: RewardMethod
+    ) -> Iterator[dict[str, float]]:
+        steps = method.schedule.each if self._fitted else method.schedule.first
+        if self._frozen:
+            return
+        if steps and not len(memory.segment_ids()):
+            self._counters['gradient steps skipped, nothing scored'] += steps
+            return
+        self._fitted = True
+        began = time.perf_counter()
+        sums: Counter[str] = Counter()
+        for i in range(steps):
+            # a stream of its own: neither interleaving nor a restart changes what it draws
+            seed_torch(self._settings.seed, 'reward', phase, i)
+            rng = generator(self._settings.seed, 'reward', phase, i)
+            sums.update(method.gradient_step(memory, rng))
+            yield {}
+        if steps:
+            means = {name: float(value) / steps for name, value in sums.items()}
+            yield means | {'fit_seconds': time.perf_counter() - began}
+
+    def _label(
+        self, phase: int, memory: Trajectories, method: RewardMethod
+    ) -> Iterator[list[StepRewards]]:
+        """Label what is new, and of what has changed as much as the settings ask for.
+
+        The memory takes the labels in as that of the learner will: it then tells what is labelled,
+        by which version, and what the learner will draw.
+        """
+        segments = due.segments_due(memory, method.version, self._settings)
+        yield from self._whole(phase, memory, method, segments)
+        if self._settings.relabel == 'all':
+            return
+        ids, within = due.steps_due(memory, method.version, self._settings, phase)
+        if not method.single_steps:
+            yield from self._whole(phase, memory, method, np.unique(ids))
+        elif len(ids):
+            labels = yield from _joined(method, method.step_passes(memory, ids, within))
+            yield self._applied(phase, memory, memory.pieces(ids, within), labels, method.version)
+
+    def _whole(
+        self, phase: int, memory: Trajectories, method: RewardMethod, ids: I64
+    ) -> Iterator[list[StepRewards]]:
+        """Label segments, `label_batch` of them at a time."""
+        for i in range(0, len(ids), method.label_batch):
+            some = ids[i : i + method.label_batch]
+            labels = yield from _joined(method, method.label_passes(memory, some))
+            yield self._applied(phase, memory, memory.segments(some), labels, method.version)
+
+    def _applied(
+        self,
+        phase: int,
+        memory: Trajectories,
+        spans: list[tuple[str, I64, I64, I64]],
+        labels: F32,
+        version: int,
+    ) -> list[StepRewards]:
+        """Labels of spans of steps, as `Trajectories.segments` says where these lie."""
+        found = []
+        at = 0
+        for source, *where in spans:
+            lengths = where[2]
+            begin = 0
+            while begin < len(lengths):
+                sizes = np.cumsum(lengths[begin:] * 4 + 12)
+                end = begin + max(1, int(np.searchsorted(sizes, PART_BYTES, side='right')))
+                steps = int(lengths[begin:end].sum())
+                episodes, firsts, counts = (a[begin:end].astype(np.uint32) for a in where)
+                part = labels[at : at + steps].copy()
+                found.append(
+                    StepRewards(
+                        self._run.run_id,
+                        phase,
+                        version,
+                        0,
+                        0,
+                        source,
+                        episodes,
+                        firsts,
+                        counts,
+                        part,
+                    )
+                )
+                at += steps
+                begin = end
+        for record in found:
+            memory.apply(record)
+        return found
+
+    def _numbered(self, phase: int, version: int, found: list[StepRewards]) -> list[StepRewards]:
+        """Join small batches into parts as large as may be, source by source, and number them; at
+        least one, if empty.
+        """
+        parts: list[list[StepRewards]] = []
+        size = PART_BYTES
+        for piece in sorted(found, key=lambda piece: piece.source):
+            weight = len(piece.labels) * 4 + len(piece.lengths) * 12
+            if size + weight > PART_BYTES or parts[-1][0].source != piece.source:
+                parts.append([])
+                size = 0
+            parts[-1].append(piece)
+            size += weight
+        if not parts:
+            empty = np.empty(0, np.uint32)
+            nothing = np.empty(0, np.float32)
+            none = StepRewards(
+                self._run.run_id, phase, version, 0, 1, '', empty, empty, empty, nothing
+            )
+            return [none]
+        return [
+            StepRewards(
+                self._run.run_id,
+                phase,
+                version,
+                i,
+                len(parts),
+                pieces[0].source,
+                np.concatenate([p.episodes for p in pieces]),
+                np.concatenate([p.first_steps for p in pieces]),
+                np.concatenate([p.lengths for p in pieces]),
+                np.concatenate([p.labels for p in pieces]),
+            )
+            for i, pieces in enumerate(parts)
+        ]
+
+    def _state(self) -> dict[str, torch.Tensor]:
+        assert self._method is not None
+        return self._method.state()
+
+    def report(self) -> dict[str, Any]:
+        """Counts and the digest of the reward model, for the run's summary."""
+        said = super().report()
+        if self._method is not None:
+            said['gradient_steps'] = self._method.gradient_steps
+            said['reward_model_sha256'] = checkpoints.digest(self._method.state())
+        if self._start is not None:
+            said['started_from'] = {
+                'checkpoint': str(self._start.path),
+                'reward_model_sha256': self._start.digest,
+                'frozen': self._frozen,
+            }
+        return said
+
+
+def _joined(
+    method: RewardMethod, passes: Iterator[F32]
+) -> Generator[list[StepRewards], None, F32]:
+    """Labels from all forward passes, a slice each.
+
+    Raises:
+        RewardModelError: one is not finite.
+    """
+    found = []
+    for labels in passes:
+        found.append(labels)
+        yield []
+    joined: F32 = np.concatenate(found)
+    if not np.isfinite(joined).all():
+        raise RewardModelError(
+            f'labels of method {method.name!r} are not finite after '
+            f'{method.gradient_steps} gradient steps: training has diverged. '
+            'Lower its learning_rate, or set target_scale=rms'
+        )
+    return joined

@@ -1,0 +1,159 @@
+"""The learner's part of Algorithm 1: permit, take in, learn, permit again."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from codetr_ros.config import Settings
+from codetr_ros.cores.consumer import Consumer
+from codetr_ros.learners import registry
+from codetr_ros.learners.base import PolicyLearner
+from codetr_ros.memory.trajectories import Trajectories
+from codetr_ros.policy.actor import weights_bytes
+from codetr_ros.records import (
+    INITIAL_VERSION,
+    TOPICS,
+    Commit,
+    CompositeReward,
+    Policy,
+    Record,
+    RecordError,
+    RunSpec,
+    StepRewards,
+    TaskSpec,
+    Transitions,
+    describe,
+)
+from codetr_ros.records.checks import check_run
+from codetr_ros.runs import checkpoints
+from codetr_ros.system.devices import usable
+
+
+class Learner(Consumer):
+    """Learns a policy, phase by phase: from labelled steps, or from the scores themselves.
+
+    Args:
+        run: the run.
+        settings: its settings.
+        name: node name.
+        folder: where checkpoints go; None keeps none.
+
+    Raises:
+        DeviceError: the device of the settings is not here.
+    """
+
+    role = 'learner'
+    subscribes: tuple[type, ...] = (TaskSpec, Transitions, Commit, StepRewards)
+
+    def __init__(self, run: RunSpec, settings: Settings, name: str, folder: Path | None) -> None:
+        usable(settings.device)  # a device that is not here is said at once
+        if not settings.labels_steps:
+            self.subscribes = (TaskSpec, Transitions, CompositeReward, Commit)
+        super().__init__(run, settings, name, folder, scores=not settings.labels_steps)
+        self._labels: dict[int, dict[int, StepRewards]] = {}
+        self._learner: PolicyLearner | None = None
+
+    def receive(self, record: Record) -> None:
+        """Hold a record until its phase's turn.
+
+        Raises:
+            RecordError: it must not be taken in; nothing has changed.
+        """
+        if not isinstance(record, StepRewards):
+            super().receive(record)
+            return
+        check_run(record, self._run)
+        if len(record.labels) != int(record.lengths.sum()):
+            raise RecordError(
+                f'{describe(record)}: {len(record.labels)} labels for segments of '
+                f'{int(record.lengths.sum())} steps'
+            )
+        if not np.isfinite(record.labels).all():
+            raise RecordError(
+                f'{describe(record)}: labels[{int(np.argmin(np.isfinite(record.labels)))}] is not '
+                'finite'
+            )
+        parts = self._labels.get(record.phase, {})
+        others = next((part.parts for part in parts.values()), record.parts)
+        if record.part >= record.parts or record.parts != others:
+            raise RecordError(
+                f'{describe(record)}: part {record.part} of {record.parts}, where others of the '
+                f'phase are of {others}: two reward nodes? Stop one of them'
+            )
+        if record.phase < self._phase or record.part in parts:
+            self.duplicated[TOPICS[StepRewards]] += 1
+        else:
+            self._labels.setdefault(record.phase, {})[record.part] = record
+
+    def _begin(self) -> Iterator[list[Record]]:
+        spec = self._intake.tasks.first
+        self._learner = registry.make(self._settings, spec.observation_size, spec.action_size)
+        for phase in range(self._settings.lag):
+            yield [self._permit(phase, INITIAL_VERSION)]
+
+    def _learn(
+        self, phase: int, memory: Trajectories, learns: bool
+    ) -> Iterator[list[Record] | None]:
+        learner = self._learner
+        assert learner is not None
+        metrics: dict[str, float] = {}
+        if learns:
+            if self._settings.labels_steps:
+                while not self._labelled(phase):
+                    yield None
+                for _, part in sorted(self._labels.pop(phase).items()):
+                    self._counters['labels of evicted steps'] += memory.apply(part)
+            for said in learner.train(phase, memory):
+                metrics |= said
+                yield []
+        metrics |= {
+            'updates': learner.updates,
+            'labelled_steps': memory.labelled_steps,
+            'memory_steps': memory.steps,
+            'memory_bytes': memory.nbytes,
+        }
+        self._phase = phase + 1
+        # the permission before the checkpoint: while it travels, the checkpoint is written
+        yield [self._permit(phase + self._settings.lag, phase), self._metrics(phase, metrics)]
+
+    def _labelled(self, phase: int) -> bool:
+        parts = self._labels.get(phase, {})
+        return bool(parts) and len(parts) == next(iter(parts.values())).parts
+
+    def _permit(self, phase: int, version: int) -> Policy:
+        learner, settings = self._learner, self._settings
+        assert learner is not None
+        sources = self._intake.tasks.sources
+        random = phase < settings.warmup_phases
+        return Policy(
+            self._run.run_id,
+            phase,
+            version,
+            sources,
+            np.array(settings.shares_of(phase), np.uint32),
+            random,
+            '' if random else learner.network,
+            b'' if random else weights_bytes(learner.actor),
+        )
+
+    def _state(self) -> dict[str, torch.Tensor]:
+        assert self._learner is not None
+        assert self._memory is not None
+        state = dict(self._learner.state())
+        for source, labels in self._memory.labels().items():
+            state[f'labels/{source}'] = torch.from_numpy(labels)
+        return state
+
+    def report(self) -> dict[str, Any]:
+        """Counts and the digest of the policy, for the run's summary."""
+        said = super().report()
+        if self._learner is None:
+            return said | {'updates': 0}
+        return said | {
+            'updates': self._learner.updates,
+            'counters': said['counters'] | self._learner.counters,
+            'policy_sha256': checkpoints.digest(self._learner.actor.state_dict()),
+        }

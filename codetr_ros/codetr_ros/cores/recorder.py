@@ -1,0 +1,178 @@
+"""What a phase consists of: the recorder decides when it is whole and commits it.
+
+The core knows nothing of bags. Whoever wires it writes everything it has been given to disk before
+passing a `Commit` on: what a node learns from is then never lost.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from codetr_ros.config import Settings
+from codetr_ros.cores.announced import Tasks
+from codetr_ros.records import (
+    TOPICS,
+    Commit,
+    CompositeReward,
+    Policy,
+    Record,
+    RecordError,
+    RunSpec,
+    TaskSpec,
+    Transitions,
+    describe,
+    metrics,
+)
+from codetr_ros.records.checks import check_run, check_score
+
+
+class Recorder:
+    """Commits a phase once every permitted step and every due composite reward has arrived.
+
+    Args:
+        run: the run.
+        settings: its settings.
+        name: node name.
+    """
+
+    subscribes: tuple[type, ...] = (TaskSpec, Policy, Transitions, CompositeReward)
+
+    def __init__(self, run: RunSpec, settings: Settings, name: str) -> None:
+        self._run = run
+        self._settings = settings
+        self._name = name
+        self._tasks = Tasks(run, settings)
+        self._permitted: dict[int, dict[str, int]] = {}
+        self._steps: Counter[tuple[int, str]] = Counter()  # (phase, source)
+        self._ended: dict[tuple[int, str], tuple[int, int]] = {}  # -> last sequence, scores due
+        self._transitions: Counter[str] = Counter()  # next sequence number of each source
+        self._scores: Counter[str] = Counter()  # next sequence number of each scorer
+        self._committed_scores: Counter[str] = Counter()
+        self.duplicated: Counter[str] = Counter()
+        self.refused = self._tasks.refused
+        self.finished = False
+        self.phase = 0  # the next to be committed
+
+    def receive(self, record: Record) -> None:
+        """Take note of what arrived.
+
+        Raises:
+            RecordError: it is no part of this run, impossible, or out of sequence; nothing has
+                changed.
+        """
+        check_run(record, self._run)
+        if isinstance(record, TaskSpec):
+            self._tasks.announce(record, self.receive)
+        elif isinstance(record, Policy):
+            due, given = self._settings.steps_of(record.phase), int(record.steps.sum())
+            if record.phase < self.phase or given != due:
+                raise RecordError(
+                    f'{describe(record)} permits {given} steps; phase {self.phase} is the next to '
+                    f'be committed, phase {record.phase} has {due}: stop the second learner'
+                )
+            steps = dict(zip(record.sources, record.steps.tolist(), strict=True))
+            self._permitted[record.phase] = {source: n for source, n in steps.items() if n}
+        elif isinstance(record, Transitions):
+            if self._tasks.admit(record) and self._next(record, self._transitions, record.source):
+                self._steps[record.phase, record.source] += record.steps
+                if record.phase_end:
+                    self._ended[record.phase, record.source] = (record.sequence, record.scores_due)
+        elif isinstance(record, CompositeReward):
+            check_score(record, self._settings.delay)
+            self._next(record, self._scores, record.scorer)
+
+    def _next(self, record: Any, due: 'Counter[str]', name: str) -> bool:
+        if record.sequence > due[name]:
+            raise RecordError(
+                f'{describe(record)} is out of sequence: {due[name]} is the next of {name!r}. '
+                'What lies between never '
+                f'arrived: restart {name!r}'
+            )
+        if record.sequence < due[name]:
+            self.duplicated[TOPICS[type(record)]] += 1
+            return False
+        due[name] += 1
+        return True
+
+    def work(self) -> Iterator[list[Record] | None]:
+        """Yield a commit for each phase, in order, as soon as it is whole."""
+        for phase in range(self._settings.phases):
+            began = time.perf_counter()
+            while not self._whole(phase):
+                yield None
+            seconds = time.perf_counter() - began
+            step = self._settings.steps_after(phase)
+            said = metrics(
+                self._run.run_id, 'record', self._name, phase, step, {'phase_seconds': seconds}
+            )
+            yield [self._commit(phase), said]
+            self.phase = phase + 1
+        self.finished = True
+        while True:
+            yield None
+
+    def _whole(self, phase: int) -> bool:
+        members = self._permitted.get(phase)
+        if not members:
+            return False
+        for source, steps in members.items():
+            end = self._ended.get((phase, source))
+            if end is None or self._steps[phase, source] != steps:
+                return False
+            if self._scores[source] < self._committed_scores[source] + end[1]:
+                return False
+        return True
+
+    def _commit(self, phase: int) -> Commit:
+        members = sorted(self._permitted.pop(phase))
+        last = []
+        scorers = set(self._scores)
+        for source in members:
+            sequence, due = self._ended.pop((phase, source))
+            del self._steps[phase, source]
+            last.append(sequence)
+            self._committed_scores[source] += due
+            scorers.add(source)
+        for scorer in scorers - set(
+            members
+        ):  # a person, an inspection: whatever they have said by now
+            self._committed_scores[scorer] = self._scores[scorer]
+        names = tuple(sorted(s for s in scorers if self._committed_scores[s]))
+        scores = np.array([self._committed_scores[s] - 1 for s in names], np.int64)
+        return Commit(
+            self._run.run_id, phase, tuple(members), np.array(last, np.int64), names, scores, ()
+        )
+
+    def waiting_for(self) -> str:
+        """What the next phase still lacks, for people."""
+        members = self._permitted.get(self.phase)
+        if not members:
+            return f'permission for phase {self.phase} from the learner'
+        lacks = []
+        for source, steps in members.items():
+            have = self._steps[self.phase, source]
+            if have < steps:
+                lacks.append(f'{steps - have} of {steps} steps of {source!r}')
+            elif (self.phase, source) in self._ended:
+                due = (
+                    self._committed_scores[source]
+                    + self._ended[self.phase, source][1]
+                    - self._scores[source]
+                )
+                if due > 0:
+                    lacks.append(f'{due} composite rewards of {source!r}')
+        return f'phase {self.phase} lacks ' + (', '.join(lacks) or 'nothing')
+
+    def close(self) -> None:
+        """Nothing to save: the bag belongs to whoever wires this core."""
+
+    def report(self) -> dict[str, Any]:
+        """Counts for the run's summary."""
+        return {
+            'duplicated': dict(self.duplicated),
+            'refused': dict(self.refused),
+            'counters': {'phases_committed': self.phase},
+        }

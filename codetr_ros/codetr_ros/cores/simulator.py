@@ -1,0 +1,205 @@
+"""A simulator: rolls out the steps that each policy permits and says what happened."""
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import torch
+
+from codetr_ros.config import Settings
+from codetr_ros.policy.acting import ActingPolicy
+from codetr_ros.records import (
+    Metrics,
+    Policy,
+    Record,
+    RecordError,
+    RunSpec,
+    Transitions,
+    describe,
+    metrics,
+)
+from codetr_ros.simulation.permission import acting_policy, check_policy
+from codetr_ros.simulation.source import Source
+from codetr_ros.system import processors
+
+
+class Simulator:
+    """Rolls out a task under the policies that it receives, in the order of their phases.
+
+    With the setting `envs` above 1 it has as many environments, and each is a source of its own:
+    with its own name, seeds, episodes and sequence numbers, as those of another simulator would
+    have. Whoever receives, keeps, verifies or plays steps therefore need not know which process
+    they come from, and the memory D has one open episode for each source, as ever. What the
+    environments have in common is the process, the policy and the turn: a slice is one chunk of
+    each, one after the other in the order of their names.
+
+    Their chunks are rolled out in threads, as many as there are processors, where that is faster:
+    MuJoCo releases the interpreter lock while it steps, and PyTorch while it multiplies, but where
+    their parts are short threads wait for each other. No source shares with another anything that
+    changes, so that threads change no bit.
+
+    Args:
+        run: the run it belongs to.
+        settings: the settings of the run.
+        name: its name, which must differ from every other simulator's of the run.
+        threads: how many, always; where None as many as there are processors, or none, whichever
+            is faster.
+
+    Raises:
+        TaskError: the task is unknown or cannot be used.
+        SettingsError: the delay exceeds the task's horizon.
+    """
+
+    subscribes: tuple[type, ...] = (Policy,)
+
+    def __init__(
+        self, run: RunSpec, settings: Settings, name: str, threads: int | None = None
+    ) -> None:
+        self._run = run
+        self._settings = settings
+        self._name = name
+        self._sources = [Source(run, settings, each) for each in settings.sources_of(name)]
+        self._waiting: dict[int, tuple[Policy, ActingPolicy | None]] = {}
+        self._phase = 0  # the next to be run
+        self._counters: Counter[str] = Counter()
+        self._closed = False
+        self.finished = False
+        workers = min(len(self._sources), threads or processors.count())
+        self._pool = (
+            # torch keeps its number of threads for each thread that calls it
+            ThreadPoolExecutor(workers, 'env', torch.set_num_threads, (settings.threads,))
+            if workers > 1
+            else None
+        )
+        self._choice = ThreadChoice() if self._pool is not None and threads is None else None
+
+    def receive(self, record: Record) -> None:
+        """Keep a policy until its phase's turn.
+
+        Raises:
+            RecordError: it is of another run, its phase has been run or is waiting, it names no
+                steps for a source of this simulator, or its weights do not fit. Nothing has
+                changed.
+        """
+        policy = check_policy(record, self._run, self._settings, f'simulator {self._name!r}')
+        ends = not policy.steps.any()
+        if ends and self.finished:
+            return  # with overlap two permit nothing; the second one serves the evaluator
+        if policy.phase < self._phase or policy.phase in self._waiting:
+            done = 'run' if policy.phase < self._phase else 'received'
+            raise RecordError(
+                f'{describe(policy)}: {self._name!r} has {done} phase={policy.phase} already: '
+                'each phase must be permitted once. Stop the second learner, if there is one'
+            )
+        for source in self._sources:
+            if not ends and source.name not in policy.sources:
+                needed = len(policy.sources) // self._settings.envs + 1
+                raise RecordError(
+                    f'{describe(policy)} names sources={list(policy.sources)}, not '
+                    f'{source.name!r}: start the run with simulators={needed}, or stop this one'
+                )
+        environment = self._sources[0].environment
+        acting = None if ends else acting_policy(policy, environment, self._settings.delay)
+        self._waiting[policy.phase] = policy, acting
+
+    def work(self) -> Iterator[list[Record] | None]:
+        """A chunk of each source per slice, of at most `CHUNK_STEPS` steps; first of all what is
+        simulated.
+        """
+        yield [source.spec() for source in self._sources]
+        while not self.finished:
+            policy, acting = self._waiting.pop(self._phase, (None, None))
+            if policy is None:
+                yield None
+                continue
+            self._phase += 1
+            if not policy.steps.any():
+                self.finished = True
+            else:
+                yield from self._run_phase(policy, acting)
+        while True:
+            yield None
+
+    def _run_phase(self, policy: Policy, acting: ActingPolicy | None) -> Iterator[list[Record]]:
+        going = [
+            source.roll_out(policy, acting) for source in self._sources if source.permitted(policy)
+        ]
+        seconds = 0.0
+        while going:
+            chunks, spent = self._chunks(going)
+            seconds += spent
+            going = [
+                rollout
+                for rollout, said in zip(going, chunks, strict=True)
+                if not _chunk(said).phase_end
+            ]
+            records = [record for said in chunks for record in said]
+            if not going:
+                self._counters['phases'] += 1
+                records.append(self._metrics(policy.phase, seconds))
+            yield records
+
+    def _chunks(self, going: list[Iterator[list[Record]]]) -> tuple[list[list[Record]], float]:
+        """The next records of each, in order, and the seconds that they took."""
+        several = len(going) > 1
+        choice = self._choice if several else None
+        threads = several if choice is None else choice.threads()
+        pool = self._pool if threads else None
+        began = time.perf_counter()
+        chunks = list(map(next, going) if pool is None else pool.map(next, going))
+        spent = time.perf_counter() - began
+        if choice is not None:
+            choice.note(threads, spent / sum(_chunk(said).steps for said in chunks))
+        return chunks, spent
+
+    def _metrics(self, phase: int, seconds: float) -> Metrics:
+        step = self._settings.steps_after(phase)
+        values = {'simulate_seconds': seconds}
+        return metrics(self._run.run_id, 'sim', self._name, phase, step, values)
+
+    def close(self) -> None:
+        """Close the environments. A simulator keeps no checkpoint."""
+        if not self._closed:
+            self._closed = True
+            if self._pool is not None:
+                self._pool.shutdown()
+            for source in self._sources:
+                source.close()
+
+    def report(self) -> dict[str, Any]:
+        """Counts for the run's summary."""
+        counters = self._counters.copy()
+        for source in self._sources:
+            counters.update(source.counters)
+        return {'lost': {}, 'duplicated': {}, 'counters': dict(counters)}
+
+
+class ThreadChoice:
+    """Whether to use threads: whatever was faster when it was last tried, and now and then the
+    other, since what is faster changes with the policy and with what else the machine does.
+    """
+
+    TRY_AGAIN = 32  # slices
+
+    def __init__(self) -> None:
+        self._seconds = {True: 0.0, False: 0.0}  # per step, by threads or none; 0: to be tried
+        self._slices = 0
+
+    def threads(self) -> bool:
+        """Whether the next slice is to use them."""
+        self._slices += 1
+        faster = self._seconds[True] <= self._seconds[False]
+        return faster != (self._slices % self.TRY_AGAIN == 0)
+
+    def note(self, threads: bool, seconds: float) -> None:
+        """Keep how many seconds a step has taken, with threads or without."""
+        self._seconds[threads] = seconds
+
+
+def _chunk(said: list[Record]) -> Transitions:
+    """The chunk among what a source said: the first record."""
+    chunk = said[0]
+    assert isinstance(chunk, Transitions)
+    return chunk

@@ -1,0 +1,54 @@
+"""What a policy learner's updates of a phase will draw from the memory: no secret to anybody.
+
+An update's randomness depends on the run's seed, the phase and the update's place in it, and on
+nothing else. So the reward side, whose memory has the same steps and the same labels, knows what
+the learner is about to draw, and need not label what it will not see (`relabel` 'drawn').
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from codetr_ros.config import Settings
+from codetr_ros.memory.trajectories import Trajectories
+from codetr_ros.records import I64
+from codetr_ros.seeding import generator
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Burst:
+    """Updates in a row, which draw from a stream of their own: neither interleaving nor a restart
+    changes what they draw.
+    """
+
+    first: int  # the number of its first update within the phase
+    updates: int
+    rng: np.random.Generator
+
+
+def updates_of(settings: Settings, phase: int) -> int:
+    """Updates that an off-policy learner takes after a phase."""
+    return round(settings.steps_of(phase) * settings.sac.updates_per_step)
+
+
+def bursts(settings: Settings, phase: int) -> Iterator[Burst]:
+    """The updates of a phase, as many at a time as `sac.burst` says."""
+    due = updates_of(settings, phase)
+    for first in range(0, due, settings.sac.burst):
+        rng = generator(settings.seed, 'learner', phase, first)
+        yield Burst(first, min(settings.sac.burst, due - first), rng)
+
+
+def drawn(settings: Settings, phase: int, memory: Trajectories) -> I64:
+    """What SAC's updates of a phase will draw from a memory, as its labelled steps are now.
+
+    Returns:
+        Places among the labelled steps (`Trajectories.draw`), ascending, each once.
+    """
+    found = np.zeros(memory.labelled_steps, np.bool_)
+    if len(found):
+        for burst in bursts(settings, phase):
+            for _ in range(burst.updates):
+                found[memory.draw(burst.rng, settings.sac.batch)] = True
+    return np.flatnonzero(found)

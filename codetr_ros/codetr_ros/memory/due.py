@@ -1,0 +1,54 @@
+"""Which labels of the memory are due, and how old those are that it holds.
+
+Ages are in versions of the model since then: in gradient steps, for a method that takes such.
+"""
+
+import numpy as np
+
+from codetr_ros.config import Settings
+from codetr_ros.memory import draws
+from codetr_ros.memory.trajectories import Trajectories
+from codetr_ros.records import I64
+
+
+def segments_due(memory: Trajectories, version: int, settings: Settings) -> I64:
+    """Segments to be labelled whole by a version of the model, in the order of their ids.
+
+    All that have no label, and with `relabel` 'all' of those with a label of another version all
+    (`relabel_steps` 0), or whole segments of at most so many steps, those with the oldest labels
+    first, among equals those with the lowest id; one at least.
+    """
+    ids = memory.segment_ids()
+    versions = memory.versions(ids)
+    new = versions < 0
+    if settings.relabel == 'drawn':
+        return ids[new]
+    stale = ~new & (versions != version)
+    if settings.relabel_steps:
+        places = np.flatnonzero(stale)
+        places = places[np.argsort(versions[places], kind='stable')]
+        steps = np.cumsum(memory.lengths(ids[places]))
+        enough = np.searchsorted(steps, settings.relabel_steps, side='right')
+        stale[places[max(1, int(enough)) :]] = False
+    due: I64 = ids[new | stale]
+    return due
+
+
+def steps_due(
+    memory: Trajectories, version: int, settings: Settings, phase: int
+) -> tuple[I64, I64]:
+    """Steps with a label of another version that the updates of a phase will draw.
+
+    Returns:
+        The id of each one's segment, and its number within the segment, ordered by both.
+    """
+    drawn = draws.drawn(settings, phase, memory)
+    return memory.located(drawn[memory.label_versions()[drawn] != version])
+
+
+def metrics(memory: Trajectories, version: int) -> dict[str, float]:
+    """How old labels are: the mean over all labelled steps, and the oldest."""
+    ages = version - memory.label_versions()
+    if not len(ages):
+        return {}
+    return {'label_age_mean': float(ages.sum() / len(ages)), 'label_age_max': float(ages.max())}

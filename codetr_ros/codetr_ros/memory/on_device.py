@@ -1,0 +1,187 @@
+"""What is read of the memory D on a device: labelled steps by SAC, segments by a reward model.
+
+A step is one row there. What is new is copied in a few pieces, and what is drawn is gathered on
+the device. `DeviceMemory` holds for SAC
+
+    s (O) | a (A) | s' (O) | gamma (1 - terminated) | label
+
+with s' spelt out, at 4 (2 O + A + 2) bytes a step: 0.9 GB for a million steps of Ant with 105
+observations. The rows are taken when the first ones come, for as many steps as each source may
+have. The labels are copied all together, as a reward model changes them all: 4 MB for a million.
+What was evicted has no label any more.
+
+`DeviceSteps` holds observation and action, at 4 (O + A) bytes a step: 140 MB for a million of Ant.
+Gathering a million steps in whole segments takes half a second on a CPU, and all of them are
+labelled in every phase: so segments are put together on the device.
+"""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from codetr_ros.memory.ring import SourceRing
+from codetr_ros.memory.trajectories import Trajectories
+from codetr_ros.records import I64
+from codetr_ros.system.devices import DeviceError
+
+COPIED_AT_ONCE = 65_536
+"""Steps that are put into rows in one go: more would take memory and save no time."""
+
+
+class DeviceMemory:
+    """Rows of steps on a device, and which of them are labelled.
+
+    The tensors stay where they are, so that a recorded update finds them, until another source
+    appears.
+
+    Args:
+        memory: the memory D, on the host.
+        discount: gamma.
+        device: where the rows lie.
+    """
+
+    def __init__(self, memory: Trajectories, discount: float, device: torch.device) -> None:
+        self.memory = memory
+        self._discount, self._device = discount, device
+        self._copied: list[int] = []  # of each source, the row after the last one that is here
+
+    def update(self) -> bool:
+        """Take in what is new in D, and what is labelled differently or gone.
+
+        Returns:
+            Whether rows lie where they lay before.
+        """
+        rings = self.memory.sources
+        stayed = len(rings) == len(self._copied)
+        if not stayed:
+            self._allocate(rings)
+        for i, (ring, rows) in enumerate(zip(rings, self._blocks(rings), strict=True)):
+            self._add(ring, rows, self._copied[i])
+            self._copied[i] = ring.end
+            held = min(ring.end, ring.capacity)
+            rows[:held, -1] = torch.from_numpy(ring.labels[:held]).to(self._device)
+        labelled = self.rows[:, -1].isfinite().nonzero().squeeze(1)  # the device is waited for
+        self._labelled[: len(labelled)] = labelled
+        self._count.fill_(len(labelled))
+        return stayed
+
+    def _allocate(self, rings: list[SourceRing]) -> None:
+        """Make room for all that the sources' rings can hold.
+
+        Raises:
+            DeviceError: the device has not got it.
+        """
+        size = sum(ring.capacity for ring in rings)
+        width = 2 * self.memory.observation_size + self.memory.action_size + 2
+        self.rows = self._labelled = torch.empty(0)  # the old ones go before the new ones come
+        try:
+            self.rows = torch.full((size, width), torch.nan, device=self._device)
+            self._labelled = torch.zeros(size, dtype=torch.int64, device=self._device)
+        except RuntimeError as error:  # torch's own where a GPU is out of memory
+            raise DeviceError(
+                f'device={self._device}: no room for {size} steps of {4 * width + 8} bytes, '
+                f'memory_steps for each of {len(rings)} environments: lower memory_steps, '
+                f'simulators or envs, or set device=cpu. torch said: {error}'
+            ) from error
+        self._count = torch.zeros((), dtype=torch.int64, device=self._device)
+        self._copied = [0] * len(rings)
+
+    def _blocks(self, rings: list[SourceRing]) -> tuple[Tensor, ...]:
+        """The rows of each source; a step lies in the row of its slot."""
+        return torch.split(self.rows, [ring.capacity for ring in rings])
+
+    def _add(self, ring: SourceRing, rows: Tensor, first: int) -> None:
+        for slots in ring.slots_from(first, COPIED_AT_ONCE):
+            steps = self.memory.steps_in(ring, slots)
+            going_on = np.float32(self._discount) * (1 - steps.terminated.astype(np.float32))
+            last = np.stack([going_on, steps.rewards], 1)
+            parts = (steps.observations, steps.actions, steps.next_observations, last)
+            new = torch.from_numpy(np.concatenate(parts, 1))
+            rows.index_copy_(0, torch.from_numpy(slots).to(self._device), new.to(self._device))
+
+    def draw(self, batch: int) -> Tensor:
+        """Rows (B,) of labelled steps, uniform and with replacement, at least one being labelled.
+
+        From the generator of the device. Odds are even up to (labelled steps) / 2^62: how many
+        steps are labelled is read on the device, so that a recorded draw follows it.
+        """
+        numbers = torch.randint(1 << 62, (batch,), device=self._device)
+        return self._labelled[numbers % self._count]
+
+    def read(self, rows: Tensor) -> tuple[Tensor, ...]:
+        """The steps of some rows (B,), as `columns` gives them."""
+        return columns(self.rows[rows], self.memory.observation_size, self.memory.action_size)
+
+
+def columns(rows: Tensor, observation_size: int, action_size: int) -> tuple[Tensor, ...]:
+    """The parts of rows (B, 2 O + A + 2), in views.
+
+    Returns:
+        s (B, O), a (B, A), labels (B,), s' (B, O), gamma (1 - terminated) (B,).
+    """
+    widths = [observation_size, action_size, observation_size, 1, 1]
+    s, a, s2, going_on, r = torch.split(rows, widths, 1)
+    return s, a, r.squeeze(1), s2, going_on.squeeze(1)
+
+
+class DeviceSteps:
+    """The steps of the memory on a device, each in the row of its slot, source after source.
+
+    Args:
+        memory: the memory D, on the host.
+        device: where the rows lie.
+    """
+
+    def __init__(self, memory: Trajectories, device: torch.device) -> None:
+        self.memory = memory
+        self._device = device
+        self._copied: list[int] = []  # of each source, the row after the last one that is here
+
+    def update(self) -> None:
+        """Take in what is new in D.
+
+        Raises:
+            DeviceError: the device has no room.
+        """
+        rings = sorted(self.memory.sources, key=lambda ring: ring.name)
+        if len(rings) != len(self._copied):
+            self._allocate(rings)
+        blocks = torch.split(self.rows, [ring.capacity for ring in rings])
+        for i, (ring, rows) in enumerate(zip(rings, blocks, strict=True)):
+            for slots in ring.slots_from(self._copied[i], COPIED_AT_ONCE):
+                new = np.concatenate([ring.observations[slots], ring.actions[slots]], 1)
+                rows[torch.from_numpy(slots).to(self._device)] = torch.tensor(new).to(self._device)
+            self._copied[i] = ring.end
+
+    def _allocate(self, rings: list[SourceRing]) -> None:
+        size = sum(ring.capacity for ring in rings)
+        width = self.memory.observation_size + self.memory.action_size
+        self.rows = torch.empty(0)  # the old ones go before the new ones come
+        try:
+            self.rows = torch.zeros(size, width, device=self._device)
+        except RuntimeError as error:  # torch's own where a GPU is out of memory
+            raise DeviceError(
+                f'reward_device={self._device}: no room for {size} steps of {4 * width} bytes: '
+                f'lower memory_steps, or set reward_device=cpu. torch said: {error}'
+            ) from error
+        capacities = torch.tensor([ring.capacity for ring in rings])
+        self._capacities = capacities.to(self._device)
+        self._firsts = (capacities.cumsum(0) - capacities).to(self._device)
+        self._copied = [0] * len(rings)
+
+    def read(self, ids: I64, context: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Segments by id, each with up to `context` steps of its episode before it.
+
+        Returns:
+            Observations (B, L, O) before each step and actions (B, L, A), 0 in the padding on the
+            right, and which steps (B, L) there are, and which of them are the segments' own.
+        """
+        places = np.stack(self.memory.places(ids, context))  # (4, B)
+        source, row, length, before = torch.from_numpy(places).to(self._device)[..., None]
+        step = torch.arange(int(places[2].max()), device=self._device)
+        there = step < length  # (B, L)
+        slots = self._firsts[source] + (row + step) % self._capacities[source]
+        steps = self.rows[slots].masked_fill_(~there[..., None], 0)
+        sizes = [self.memory.observation_size, self.memory.action_size]
+        observations, actions = torch.split(steps, sizes, -1)
+        return observations, actions, there, there & (step >= before)

@@ -1,0 +1,209 @@
+"""A policy to act with, one observation at a time: made from what the learner published.
+
+Between them a policy travels as a JSON description and safetensors bytes, never as a pickle.
+Shapes: O = observation size, A = action size.
+"""
+
+import json
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from codetr_ros.policy.actor import (
+    KINDS,
+    LOG_STD_RANGE,
+    Actor,
+    StandardisedActor,
+    describe,
+    linear_layers,
+    standardise,
+)
+from codetr_ros.records import F32, Policy
+
+MAX_LAYERS = 8
+
+
+MAX_WIDTH = 65_536
+
+
+class NetworkError(ValueError):
+    """A policy that cannot be acted with: the message names what was expected and what came."""
+
+
+class ActingPolicy:
+    """A policy to act with, one observation at a time.
+
+    The same weights, observation and noise give the same bits in every process (of one CPU type
+    and thread count): the weights are copied into memory of their own, because the last bit of a
+    product with one row depends on where its matrix lies, and a received message lies anywhere.
+
+    Args:
+        actor: the network.
+        segment_steps: as in `describe`.
+    """
+
+    def __init__(self, actor: Actor | StandardisedActor, segment_steps: int = 0) -> None:
+        self.layers = [(_own(layer.weight), _own(layer.bias)) for layer in linear_layers(actor)]
+        self._segment_steps = segment_steps
+        self._activate = torch.relu_
+        self._log_std: Tensor | None = None
+        self._moments: tuple[Tensor, Tensor] | None = None
+        if isinstance(actor, StandardisedActor):
+            self._activate = torch.tanh_
+            self._log_std = _own(actor.log_std)
+            self._moments = _own(actor.observation_mean), _own(actor.observation_deviation)
+
+    @classmethod
+    def from_record(
+        cls, policy: Policy, observation_size: int, action_size: int, delay: int = 0
+    ) -> 'ActingPolicy':
+        """The policy that a record carries.
+
+        Args:
+            policy: what the learner published. The widths of its layers are its own affair.
+            observation_size: O of the task that it is to act in.
+            action_size: A of that task.
+            delay: steps n of the segments into which episodes are cut; 0 where they are not.
+
+        Raises:
+            NetworkError: the policy is of another architecture or for other segments, or its
+                weights are missing, unknown, of another shape or type, not finite, or not
+                safetensors at all.
+        """
+        name = f'policy of phase {policy.phase}, version {policy.version}'
+        if policy.random:
+            raise NetworkError(
+                f'{name} is random and has no weights: draw its actions uniformly from [-1, 1]'
+            )
+        said = _parse(policy.network, name)
+        hidden, segment_steps = _hidden(said, name), _segment_steps(said, name, delay)
+        kind = next((kind for kind in KINDS if kind == said.get('kind')), 'tanh_gaussian_mlp')
+        expected = describe(observation_size, action_size, hidden, segment_steps, kind)
+        if policy.network != expected:
+            raise NetworkError(
+                f'{name} is of another architecture: this task needs {expected}, '
+                f'the policy is {policy.network}; '
+                'learner and simulator need the same task and the same version of codetr_ros'
+            )
+        try:
+            tensors = safetensors.torch.load(policy.weights)
+        except (safetensors.SafetensorError, KeyError) as error:
+            raise NetworkError(
+                f'{name}: its {len(policy.weights)} bytes of weights are not safetensors: {error}'
+            ) from None
+        with torch.device('meta'):
+            actor = KINDS[kind](observation_size + (segment_steps > 0), action_size, hidden)
+        _check(tensors, actor.state_dict(), name)
+        actor.load_state_dict(tensors, assign=True)
+        return cls(actor, segment_steps)
+
+    def act(self, observation: F32, noise: F32 | None = None, step: int | None = None) -> F32:
+        """The action for one observation.
+
+        Args:
+            observation: (O,), finite.
+            noise: (A,) standard normal numbers; None for the deterministic action.
+            step: number of the step in its episode; a policy that sees how far the segment is
+                needs it.
+
+        Returns:
+            (A,) in [-1, 1]: tanh(mean), or tanh(mean + std * noise).
+
+        Raises:
+            NetworkError: the policy needs to know the step, and it was not said.
+        """
+        x = torch.from_numpy(observation)
+        if self._segment_steps:
+            if step is None:
+                raise NetworkError(
+                    'this policy sees how far the segment is: give it the number of the step in '
+                    'its episode'
+                )
+            place = step % self._segment_steps / self._segment_steps
+            x = torch.cat([x, torch.tensor([place])])
+        if self._moments is not None:
+            x = standardise(x, *self._moments)
+        for weight, bias in self.layers[:-1]:
+            x = self._activate(torch.addmv(bias, weight, x))
+        weight, bias = self.layers[-1]
+        out = torch.addmv(bias, weight, x)
+        mean, log_std = out.chunk(2) if self._log_std is None else (out, self._log_std)
+        if noise is not None:
+            std = log_std.clamp(*LOG_STD_RANGE).exp_()
+            mean = torch.addcmul(mean, std, torch.from_numpy(noise))
+        action: F32 = mean.tanh().clamp_(-1.0, 1.0).numpy()
+        return action
+
+
+def _own(tensor: Tensor) -> Tensor:
+    """A copy in fresh memory, which torch aligns to 64 bytes."""
+    return torch.empty(tensor.shape, dtype=tensor.dtype).copy_(tensor.detach())
+
+
+def _parse(network: str, name: str) -> dict[str, Any]:
+    """What a description says."""
+    try:
+        said = json.loads(network)
+        if not isinstance(said, dict) or not {'hidden', 'segment_steps'} <= said.keys():
+            raise ValueError
+    except ValueError:
+        raise NetworkError(
+            f"{name}: its network description is not one of this version's: {network!r}; "
+            f'expected something like {describe(1, 1, [256, 256])}'
+        ) from None
+    return said
+
+
+def _hidden(said: dict[str, Any], name: str) -> list[int]:
+    """Hidden widths that a description names."""
+    hidden = said['hidden']
+    if (
+        not isinstance(hidden, list)
+        or not 1 <= len(hidden) <= MAX_LAYERS
+        or not all(type(width) is int and 1 <= width <= MAX_WIDTH for width in hidden)
+    ):
+        raise NetworkError(
+            f'{name}: its network description names hidden widths {hidden!r}; '
+            f'allowed are 1 to {MAX_LAYERS} whole numbers from 1 to {MAX_WIDTH}'
+        )
+    return hidden
+
+
+def _segment_steps(said: dict[str, Any], name: str, delay: int) -> int:
+    """Steps of the segments that a description is for; 0 where it does not matter."""
+    steps = said['segment_steps']
+    if type(steps) is not int or steps not in (0, delay):
+        raise NetworkError(
+            f'{name}: its network description names segments of {steps!r} steps, where they have '
+            f'{delay}: learner and simulator need the same setting delay'
+        )
+    return steps
+
+
+def _check(tensors: dict[str, Tensor], expected: dict[str, Tensor], name: str) -> None:
+    """Refuse weights that do not fit, before anything is made of them."""
+    if tensors.keys() != expected.keys():
+        raise NetworkError(
+            f'{name}: missing weights {sorted(expected.keys() - tensors.keys())}, '
+            f'unknown weights {sorted(tensors.keys() - expected.keys())}'
+        )
+    for key, tensor in tensors.items():
+        came = (str(tensor.dtype), tuple(tensor.shape))
+        due = ('torch.float32', tuple(expected[key].shape))
+        if came != due:
+            raise NetworkError(f'{name}: weight {key!r} is {came}, expected {due}')
+        strange = tensor.numel() - int(torch.isfinite(tensor).sum())
+        if strange:
+            raise NetworkError(
+                f'{name}: {strange} of {tensor.numel()} numbers of weight {key!r} are not finite; '
+                'the learner has diverged: look at its losses and the scale of its rewards'
+            )
+
+
+def uniform_actions(rng: np.random.Generator, steps: int, size: int) -> F32:
+    """Actions (steps, size), each number uniform in [-1, 1)."""
+    return rng.random((steps, size), dtype=np.float32) * 2 - 1

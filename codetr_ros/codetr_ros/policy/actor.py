@@ -1,0 +1,146 @@
+"""The policy network: what the learner trains, and what simulators and the evaluator act with.
+
+Between them it travels as a JSON description and safetensors bytes, never as a pickle. Shapes: B =
+batch, O = observation size, A = action size, H = width of a hidden layer.
+"""
+
+import json
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import safetensors
+import safetensors.torch
+import torch
+from torch import Tensor, nn
+
+LOG_STD_RANGE = (-10.0, 2.0)
+"""Hard clip of the log standard deviation (jaxrl)."""
+
+
+OBSERVATION_CLIP = 10.0
+"""Standardised observations are clipped to this many deviations (baselines' VecNormalize)."""
+
+
+def describe(
+    observation_size: int,
+    action_size: int,
+    hidden: Sequence[int],
+    segment_steps: int = 0,
+    kind: str = 'tanh_gaussian_mlp',
+) -> str:
+    """The description of a policy network that goes into `Policy.network`: canonical JSON.
+
+    Two networks have the same description exactly if the weights of one fit the other and mean the
+    same.
+
+    Args:
+        observation_size: O of the task.
+        action_size: A of the task.
+        hidden: widths of the hidden layers.
+        segment_steps: steps n of a segment where the policy sees how far the segment is: (t - t_i)
+            / n for step t of a segment that began at t_i is then one more input; 0 where not.
+        kind: which network it is, a name in `KINDS`.
+    """
+    description = {
+        'kind': kind,
+        'observation_size': observation_size,
+        'action_size': action_size,
+        'hidden': list(hidden),
+        'segment_steps': segment_steps,
+        **KINDS[kind].constants,
+    }
+    return json.dumps(description, sort_keys=True, separators=(',', ':'))
+
+
+class Actor(nn.Module):
+    """A Gaussian over actions before their squash by tanh (jaxrl's NormalTanhPolicy).
+
+    Both heads are one linear layer: its first A outputs are the mean, the last A the log standard
+    deviation. Initial weights are orthogonal, with gain sqrt(2) in the network and 1 in each head;
+    biases are zero.
+    """
+
+    constants = {'activation': 'relu', 'log_std_range': list(LOG_STD_RANGE)}
+
+    def __init__(self, observation_size: int, action_size: int, hidden: Sequence[int]) -> None:
+        super().__init__()
+        self.action_size = action_size
+        self.body = _body(observation_size, hidden, nn.ReLU)
+        self.heads = nn.Linear(hidden[-1], 2 * action_size)
+        for layer in linear_layers(self):
+            nn.init.zeros_(layer.bias)
+            if layer is not self.heads:
+                nn.init.orthogonal_(layer.weight, math.sqrt(2))
+        with torch.no_grad():
+            for head in self.heads.weight.chunk(2):
+                nn.init.orthogonal_(head)
+
+    def forward(self, observations: Tensor) -> tuple[Tensor, Tensor]:
+        """Means and log standard deviations, both (B, A), for observations (B, O)."""
+        mean, log_std = self.heads(self.body(observations)).chunk(2, -1)
+        return mean, log_std.clamp(*LOG_STD_RANGE)
+
+
+class StandardisedActor(nn.Module):
+    """A Gaussian over actions before their squash by tanh, for standardised observations.
+
+    The standard deviation is the same in every state. The moments of the observations are no
+    parameters, but travel with them. Initial weights are orthogonal, with gain sqrt(2) in the
+    network and 0.01 for the mean (as baselines' MlpPolicy has them, recalled); biases and log
+    standard deviations are zero.
+    """
+
+    constants = {'activation': 'tanh', 'observation_clip': OBSERVATION_CLIP}
+    observation_mean: Tensor
+    observation_deviation: Tensor
+
+    def __init__(self, observation_size: int, action_size: int, hidden: Sequence[int]) -> None:
+        super().__init__()
+        self.body = _body(observation_size, hidden, nn.Tanh)
+        self.mean = nn.Linear(hidden[-1], action_size)
+        self.log_std = nn.Parameter(torch.zeros(action_size))
+        self.register_buffer('observation_mean', torch.zeros(observation_size))
+        self.register_buffer('observation_deviation', torch.ones(observation_size))
+        orthogonal(self.body, math.sqrt(2))
+        orthogonal(self.mean, 0.01)
+
+    def forward(self, observations: Tensor) -> tuple[Tensor, Tensor]:
+        """Means (B, A) for standardised observations (B, O), and log standard deviations (A,)."""
+        return self.mean(self.body(observations)), self.log_std.clamp(*LOG_STD_RANGE)
+
+
+KINDS: dict[str, type[Actor | StandardisedActor]] = {
+    'tanh_gaussian_mlp': Actor,
+    'standardised_tanh_gaussian_mlp': StandardisedActor,
+}
+"""Policy networks by the name that a description gives them."""
+
+
+def _body(inputs: int, hidden: Sequence[int], activation: type[nn.Module]) -> nn.Sequential:
+    body = nn.Sequential()
+    for width, following in pairwise([inputs, *hidden]):
+        body.extend([nn.Linear(width, following), activation()])
+    return body
+
+
+def orthogonal(network: nn.Module, gain: float) -> None:
+    """Give the linear layers of a network orthogonal weights of this gain, and zero biases."""
+    for layer in linear_layers(network):
+        nn.init.orthogonal_(layer.weight, gain)
+        nn.init.zeros_(layer.bias)
+
+
+def standardise(observations: Tensor, mean: Tensor, deviation: Tensor) -> Tensor:
+    """Observations (..., O) in deviations from the mean, clipped."""
+    return ((observations - mean) / deviation).clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP)
+
+
+def linear_layers(network: nn.Module) -> list[nn.Linear]:
+    """The layers with weights, from the observation to the actions."""
+    return [layer for layer in network.modules() if isinstance(layer, nn.Linear)]
+
+
+def weights_bytes(actor: nn.Module) -> bytes:
+    """The weights of a policy network as safetensors: the same weights give the same bytes."""
+    return safetensors.torch.save(actor.state_dict())

@@ -1,0 +1,295 @@
+"""The processes of a run over topics: starting, watching and ending them. No ROS in here.
+
+However the parent ends, no process outlives it: each is asked to end (SIGINT), given a deadline
+and then killed, and should the parent itself be killed, the kernel sends them SIGINT.
+"""
+
+import ctypes
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from codetr_ros.config import Settings
+from codetr_ros.processes import middleware
+from codetr_ros.runs import folder as run_folder
+
+EXECUTABLES = {
+    'sim': ('sim_node', 'sim'),
+    'evaluate': ('sim_node', 'evaluate'),
+    'reward': ('reward_node', 'reward'),
+    'learner': ('learner_node', 'learner'),
+    'record': ('codetr_ros', 'record'),
+}
+"""Role -> package and executable, as `ros2 run` takes them."""
+
+STOP_DEADLINE = 20.0
+"""Seconds from SIGINT to SIGKILL: a node ends its present slice, then writes a checkpoint."""
+HURRIED_DEADLINE = 2.0
+"""The same after a second Ctrl-C."""
+_POLL = 0.02  # seconds between looks at processes that are to end
+
+
+class LaunchError(RuntimeError):
+    """Processes that cannot be started: says which and what to do."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """One process to start.
+
+    Attributes:
+        name: what people call it; its log is `<name>.log`.
+        role: one of `records.ROLES`.
+        arguments: the executable's path and its arguments.
+    """
+
+    name: str
+    role: str
+    arguments: tuple[str, ...]
+
+
+def executable(role: str, environ: Mapping[str, str] = os.environ) -> Path:
+    """Find a node's executable: in this environment's prefix, else through AMENT_PREFIX_PATH.
+
+    Raises:
+        LaunchError: it is in none of them; says where was looked and how to build or source the
+            workspace.
+    """
+    package, name = EXECUTABLES[role]
+    prefixes = [sys.prefix, *filter(None, environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep))]
+    for prefix in prefixes:
+        path = Path(prefix) / 'lib' / package / name
+        if os.access(path, os.X_OK) and path.is_file():
+            return path
+    raise LaunchError(
+        f'the node executable {package}/{name} is in none of {", ".join(dict.fromkeys(prefixes))} '
+        f'(as lib/{package}/{name}): build the workspace (`make build`, or `colcon build` and '
+        '`. install/setup.bash`), or train without nodes with --in-process'
+    )
+
+
+def commands(
+    settings: Settings, run_id: str, folder: Path, environ: Mapping[str, str] = os.environ
+) -> list[Command]:
+    """The processes of a run, in the order in which they start (any other would do).
+
+    Raises:
+        LaunchError: an executable is missing.
+    """
+    nodes = [(name, 'sim') for name in settings.simulator_names]
+    nodes += [(role, role) for role in settings.roles if role != 'sim']
+    found = []
+    for name, role in nodes:
+        arguments = [str(executable(role, environ)), '--ros-args', '-r', f'__ns:=/run_{run_id}']
+        if role == 'sim' and name != 'sim':
+            arguments += ['-r', f'__node:={name}']
+        parameters = {'folder': str(folder)}
+        if role == 'learner':
+            parameters |= {'config': str(folder / run_folder.CONFIG), 'run_id': run_id}
+        for parameter, value in parameters.items():
+            # ROS reads the value as YAML: without quotes, blanks and colons in a path break it.
+            arguments += ['-p', f'{parameter}:={json.dumps(value, ensure_ascii=False)}']
+        found.append(Command(name, role, tuple(arguments)))
+    return found
+
+
+def environment(settings: Settings, environ: Mapping[str, str] = os.environ) -> dict[str, str]:
+    """The environment of a run's processes: this one's, with what the run needs."""
+    return {
+        **middleware.DEFAULTS,
+        'PYTHONUNBUFFERED': '1',
+        **environ,
+        **threading_environment(settings),
+    }
+
+
+def threading_environment(settings: Settings) -> dict[str, str]:
+    """How many threads torch and numpy take, and how they wait."""
+    return {
+        'OMP_NUM_THREADS': str(settings.threads),
+        # Spinning OpenMP threads of several processes starve each other where cores are few.
+        'OMP_WAIT_POLICY': 'PASSIVE',
+    }
+
+
+def end_with_parent(number: signal.Signals = signal.SIGINT) -> Callable[[], None] | None:
+    """What a child calls before it becomes another program, so as not to outlive its parent.
+
+    Linux only (elsewhere None): prctl(PR_SET_PDEATHSIG) makes the kernel send the signal when the
+    parent dies (to be exact: the thread that started the child), however it dies, SIGKILL
+    included. Everything is looked up here: between fork and exec nothing but the call itself is
+    safe.
+
+    Args:
+        number: the signal; SIGINT lets the child save what it has.
+    """
+    if not sys.platform.startswith('linux'):
+        return None
+    prctl = ctypes.CDLL(None, use_errno=True).prctl
+    set_parent_death_signal = 1  # linux/prctl.h
+    parent = os.getpid()
+
+    def call() -> None:
+        prctl(set_parent_death_signal, int(number), 0, 0, 0)
+        if os.getppid() != parent:  # it died before the call: the signal will never come
+            os._exit(1)
+
+    return call
+
+
+@dataclass
+class Node:
+    """A process that was started."""
+
+    command: Command
+    process: subprocess.Popen[bytes]
+    log: Path
+    asked: bool = False  # to end, by a signal of ours
+    killed: bool = False  # by us, because it did not end when asked
+
+    @property
+    def name(self) -> str:
+        """What people call it."""
+        return self.command.name
+
+    @property
+    def role(self) -> str:
+        """One of `records.ROLES`."""
+        return self.command.role
+
+    @property
+    def code(self) -> int | None:
+        """Exit code (negative: the signal that ended it), None while it runs."""
+        return self.process.poll()
+
+    @property
+    def unasked_failure(self) -> bool:
+        """Whether it ended with an error, and not because it was asked to."""
+        return self.code not in (None, 0) and not self.asked
+
+    def how_it_ended(self) -> str:
+        """For people."""
+        code = self.code
+        if code is None:
+            return f'{self.name} is running'
+        if code >= 0:
+            return f'{self.name} ended with exit code {code}'
+        try:
+            return f'{self.name} was ended by {signal.Signals(-code).name}'
+        except ValueError:
+            return f'{self.name} was ended by signal {-code}'
+
+    def interrupt(self) -> None:
+        """Ask it to end."""
+        self.asked = True
+        if self.code is None:  # not yet waited for, so its number cannot be anybody else's by now
+            os.kill(self.process.pid, signal.SIGINT)
+
+
+def end_of_log(path: Path, lines: int = 15) -> str:
+    """The last lines of a log, for people; empty where there are none."""
+    try:
+        with path.open('rb') as file:
+            file.seek(0, os.SEEK_END)
+            file.seek(max(0, file.tell() - 20_000))
+            text = file.read().decode(errors='replace')
+    except OSError as error:
+        return f'({path} cannot be read: {error.strerror})'
+    return '\n'.join(text.rstrip().splitlines()[-lines:])
+
+
+@dataclass
+class Processes:
+    """All processes of a run. A context manager: on leaving it, none is left.
+
+    Attributes:
+        say: tells people what is being done about a process that does not end.
+        hurry: whether the user has asked again; deadlines are short then.
+    """
+
+    say: Callable[[str], None]
+    hurry: Callable[[], bool] = lambda: False
+    stop_deadline: float = STOP_DEADLINE
+    nodes: list[Node] = field(default_factory=list)
+
+    def start(self, commands: Iterable[Command], logs: Path, env: Mapping[str, str]) -> None:
+        """Start processes, each in a session of its own (Ctrl-C reaches only us) with a log.
+
+        Raises:
+            LaunchError: one cannot be started; those started before it still run (see `stop`).
+        """
+        prepare = end_with_parent()
+        for command in commands:
+            log = logs / f'{command.name}.log'
+            with log.open('wb') as file:
+                file.write(f'$ {shlex.join(command.arguments)}\n'.encode())
+                file.flush()
+                try:
+                    process = subprocess.Popen(
+                        command.arguments,
+                        stdin=subprocess.DEVNULL,
+                        stdout=file,
+                        stderr=subprocess.STDOUT,
+                        env=dict(env),
+                        start_new_session=True,
+                        # It makes one system call, looked up before: safe beside ROS's threads.
+                        preexec_fn=prepare,  # noqa: PLW1509
+                    )
+                except OSError as error:
+                    what = f'{command.name} ({command.arguments[0]})'
+                    raise LaunchError(f'{what} cannot be started: {error.strerror}') from error
+            self.nodes.append(Node(command, process, log))
+
+    def running(self) -> list[Node]:
+        """Those that have not ended."""
+        return [node for node in self.nodes if node.code is None]
+
+    def failed(self) -> Node | None:
+        """The first that ended with an error and was not told to end."""
+        return next((node for node in self.nodes if node.unasked_failure), None)
+
+    def stop(self) -> None:
+        """Ask all that run to end: first the loop, then the recorder, that it may miss nothing."""
+        self._end([node for node in self.running() if node.role != 'record'])
+        self._end(self.running())
+
+    def kill(self, nodes: Sequence[Node]) -> None:
+        """End processes, and all that they have started, at once."""
+        for node in nodes:
+            if node.code is None:
+                node.killed = node.asked = True
+                # Not yet waited for, so its number cannot be anybody else's by now.
+                os.killpg(node.process.pid, signal.SIGKILL)
+                node.process.wait()
+
+    def _end(self, nodes: Sequence[Node]) -> None:
+        for node in nodes:
+            node.interrupt()
+        began = time.monotonic()
+        while waiting := [node for node in nodes if node.code is None]:
+            limit = (
+                min(self.stop_deadline, HURRIED_DEADLINE) if self.hurry() else self.stop_deadline
+            )
+            if time.monotonic() - began > limit:
+                for node in waiting:
+                    self.say(f'{node.name} did not end {limit:g} s after SIGINT: killing it')
+                self.kill(waiting)
+                return
+            time.sleep(_POLL)
+
+    def __enter__(self) -> 'Processes':
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        try:
+            if self.running():
+                self.stop()
+        finally:
+            self.kill(self.running())

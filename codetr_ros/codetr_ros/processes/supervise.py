@@ -1,0 +1,150 @@
+"""Watching the processes of a run until it is over, however it ends."""
+
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any
+
+from codetr_ros.processes.launcher import Node, Processes
+from codetr_ros.records import Presence, Record
+from codetr_ros.runs import folder as run_folder
+
+SILENCE_DEADLINE = 90.0
+"""Seconds of silence that the last nodes may take to end after the others."""
+
+
+class Interrupts:
+    """Counts how often the user has asked to stop (SIGINT, SIGTERM), instead of dying of it.
+
+    Attributes:
+        count: how often.
+        raising: raise KeyboardInterrupt from the second on, for code that does not look here
+            often.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.raising = False
+        self._before: dict[signal.Signals, Any] = {}
+
+    def __enter__(self) -> 'Interrupts':
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._before[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def again(self) -> bool:
+        """Whether the user has asked more than once."""
+        return self.count > 1
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.count += 1
+        if self.raising and self.again():
+            raise KeyboardInterrupt
+
+
+class Silence:
+    """How long nothing was heard of a run. Presence does not count: nodes that hang say it."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._last = clock()
+
+    def receive(self, record: Record) -> None:
+        """Take note of a record."""
+        if not isinstance(record, Presence):
+            self.broken()
+
+    def broken(self) -> None:
+        """Something was heard."""
+        self._last = self._clock()
+
+    @property
+    def seconds(self) -> float:
+        """Since something was last heard."""
+        return self._clock() - self._last
+
+
+def supervise(
+    processes: Processes,
+    poll: Callable[[], None],
+    interrupts: Interrupts,
+    silence: Silence,
+    gave_up: Callable[[Node], str | None] = lambda node: None,
+    deadline: float = SILENCE_DEADLINE,
+) -> str | None:
+    """Watch until every process has ended; end them when one fails or the user asks.
+
+    Args:
+        processes: those of the run, started.
+        poll: hands on what arrived and waits a moment for more.
+        interrupts: whether the user has asked to stop.
+        silence: fed by `poll`.
+        gave_up: of a node that ended well: why it did so before the run was over, or
+            None.
+        deadline: seconds of silence after which nodes that have not ended with the others are
+            ended.
+
+    Returns:
+        Why the run failed; None if it finished or was interrupted.
+    """
+    ended = 0
+    while True:
+        poll()
+        if interrupts.count:
+            processes.say('stopping: nodes end their slice and save (Ctrl-C again to hurry)')
+            processes.stop()
+            return _after_stop(processes)
+        running = processes.running()
+        if (failed := processes.failed()) is not None:
+            return _stop_all(processes, failed.how_it_ended())
+        for node in processes.nodes:
+            if node.code == 0 and (reason := gave_up(node)) is not None:
+                return _stop_all(processes, reason)
+        if not running:
+            return None
+        if len(processes.nodes) - len(running) > ended:
+            ended = len(processes.nodes) - len(running)
+            silence.broken()
+        if ended and silence.seconds > deadline:
+            names = ', '.join(node.name for node in running)
+            text = f'{names} did not end within {deadline:g} s after the rest of the run'
+            return _stop_all(processes, text)
+
+
+def _stop_all(processes: Processes, reason: str) -> str:
+    if left := processes.running():
+        names = ', '.join(node.name for node in left)
+        processes.say(f'{reason}: stopping {names}')
+    processes.stop()
+    return reason
+
+
+def _after_stop(processes: Processes) -> str | None:
+    """An interrupted run has failed only where a node did not end as it should."""
+    # SIGINT itself ends a process that has not yet come so far as to handle it.
+    clean = (0, -signal.SIGINT)
+    odd = [node.how_it_ended() for node in processes.nodes if node.code not in clean]
+    return '; '.join(odd) or None
+
+
+def why_it_gave_up(node: Node, folder: Path) -> str | None:
+    """Read from a node's report whether it ended before its run was over."""
+    path = run_folder.report_path(folder, node.role, node.name)
+    if not path.is_file():
+        return f'{node.name} ended without a report'
+    report = run_folder.read_report(path)
+    if report.get('finished') is False:
+        error = report.get('error')
+        return f'{node.name} ended before the run had finished' + (f': {error}' if error else '')
+    return None

@@ -1,0 +1,75 @@
+"""What a record must fulfil before any part of a run takes it in."""
+
+import numpy as np
+
+from codetr_ros.records import (
+    CompositeReward,
+    Record,
+    RecordError,
+    RunSpec,
+    TaskSpec,
+    Transitions,
+    describe,
+)
+
+
+def check_run(record: Record, run: RunSpec) -> None:
+    """Refuse a record of another run.
+
+    Raises:
+        RecordError: names both runs.
+    """
+    if record.run_id != run.run_id:
+        raise RecordError(
+            f'{describe(record)} is of run {record.run_id!r}, this is run {run.run_id!r}: stop '
+            'the other run, or give '
+            f'each run a namespace of its own'
+        )
+
+
+def check_transitions(chunk: Transitions, spec: TaskSpec) -> None:
+    """Refuse steps that the task cannot have.
+
+    Raises:
+        RecordError: names the field, its value and what the task has.
+    """
+    shapes = (
+        ('observations', chunk.observations, (chunk.steps + 1, spec.observation_size)),
+        ('actions', chunk.actions, (chunk.steps, spec.action_size)),
+    )
+    for name, array, expected in shapes:
+        if chunk.steps < 1 or array.shape != expected:
+            raise RecordError(
+                f'{describe(chunk)}: {name} have shape {array.shape}, {expected} expected of task '
+                f'{spec.task} as '
+                f'{spec.source!r} announced it'
+            )
+        bad = np.argwhere(~np.isfinite(array))
+        if len(bad):
+            step, component = bad[0].tolist()
+            raise RecordError(
+                f'{describe(chunk)}: {name}[{step}, {component}] is {array[step, component]}: all '
+                'values must be finite; '
+                f'mend what {spec.source!r} publishes'
+            )
+    if chunk.first_step + chunk.steps > spec.horizon:
+        raise RecordError(
+            f'{describe(chunk)}: step {chunk.first_step + chunk.steps} lies beyond the horizon '
+            f'{spec.horizon} of {spec.task}'
+        )
+
+
+def check_score(reward: CompositeReward, delay: int) -> None:
+    """Refuse a composite reward that no segment can have.
+
+    Raises:
+        RecordError: names the field and its value.
+    """
+    if not np.isfinite(reward.value):
+        raise RecordError(
+            f'{describe(reward)}: value is {reward.value}: a composite reward must be finite'
+        )
+    if not 1 <= reward.length <= delay:
+        raise RecordError(
+            f'{describe(reward)}: length is {reward.length}: a segment has 1 to {delay} steps'
+        )

@@ -1,0 +1,194 @@
+"""What a reward method is: it turns composite rewards of segments into a reward for every step."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from codetr_ros.config import Settings
+from codetr_ros.memory.batches import SegmentBatch
+from codetr_ros.memory.trajectories import Trajectories, measure_scale
+from codetr_ros.records import F32
+
+
+class RewardModelError(ValueError):
+    """A reward model cannot be asked, trained or restored: names value, field and remedy."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Gradient steps that a method takes in each phase that it learns from."""
+
+    first: int
+    """After the last phase of the warm-up."""
+    each: int
+    """After every later phase."""
+
+
+class RewardMethod(ABC):
+    """One way of making step rewards. Algorithm 1 knows reward methods by this class only.
+
+    In each phase that is learnt from it calls `prepare`, then `gradient_step` as often as
+    `schedule` says, then `label_passes`: where `version` has risen of all segments, or of those
+    with the oldest labels (`relabel_steps`), or of those that will be drawn (`relabel`), and of
+    the new ones in any case.
+
+    Labels are in the unit that `settings.reward_unit` asks for: in units of the target scale c
+    (`scaled`), or as the task gives them (`raw`).
+
+    Args:
+        settings: the run's settings.
+        observation_size: O.
+        action_size: A.
+    """
+
+    name: ClassVar[str]
+    in_process_only: ClassVar[bool] = False
+    """A reference that runs in process only: it sees what no node may see, or ignores scores."""
+    needs_true_rewards: ClassVar[bool] = False
+    """Its memory must hold the environment's own rewards."""
+    context: int = 0
+    """Steps before a segment that `label` wants in its batches: pass it to `segment_batch`."""
+    label_batch: int = 256
+    """Segments labelled at a time: how long a slice of labelling is."""
+
+    def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
+        self._settings = settings
+        self.target_scale = 0.0
+        """The unit c of composite rewards per step; 0 before `prepare`."""
+        self.gradient_steps = 0
+        """Gradient steps taken."""
+
+    @property
+    def schedule(self) -> Schedule:
+        """Gradient steps of a phase; none unless a method says otherwise."""
+        return Schedule(0, 0)
+
+    @property
+    def version(self) -> int:
+        """A number that rises whenever labels given before may have changed."""
+        return self.gradient_steps
+
+    def prepare(self, memory: Trajectories) -> None:
+        """See the memory before a phase's gradient steps and labels.
+
+        The first time it freezes what stays as it is from then on, the target scale c among it;
+        `memory` holds a scored segment.
+        """
+        if not self.target_scale:
+            self.target_scale = measure_scale(self._settings.target_scale, memory)
+
+    def gradient_step(self, memory: Trajectories, rng: np.random.Generator) -> dict[str, float]:
+        """Learn from one batch, drawn from `memory` with `rng`; nothing unless a method does.
+
+        What else is random (dropout) comes from torch's global generator, which the caller seeds.
+
+        Returns:
+            What there is to say about the step, by name.
+
+        Raises:
+            RewardModelError: not prepared, or training has diverged; nothing has changed then.
+        """
+        return {}
+
+    @abstractmethod
+    def label(self, batch: SegmentBatch) -> F32:
+        """Step rewards (B, L) of segments, in the places of the batch's steps.
+
+        Outside of `segment_steps(batch)`, in context and padding, they are 0.
+
+        Raises:
+            RewardModelError: `prepare` was never called.
+        """
+
+    def label_passes(self, memory: Trajectories, ids: NDArray[np.int64]) -> Iterator[F32]:
+        """Labels of the segments' steps one after the other, forward pass by forward pass."""
+        batch = memory.segment_batch(ids, self.context)
+        yield self.label(batch)[segment_steps(batch)]
+
+    @property
+    def single_steps(self) -> bool:
+        """Whether some steps of a segment are labelled at less cost than all: by `step_passes`."""
+        return False
+
+    def step_passes(
+        self, memory: Trajectories, ids: NDArray[np.int64], within: NDArray[np.int64]
+    ) -> Iterator[F32]:
+        """Labels of single steps, where `single_steps` says so, forward pass by forward pass.
+
+        Args:
+            memory: holds them.
+            ids: each step's segment.
+            within: its number within the segment.
+        """
+        raise NotImplementedError(f'method {self.name!r} labels whole segments')
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Everything that it takes to go on from here, in copies."""
+        return {'target_scale': torch.tensor(self.target_scale, dtype=torch.float64)}
+
+    def load_state(self, state: Mapping[str, torch.Tensor]) -> None:
+        """Go on from a `state()`.
+
+        Raises:
+            RewardModelError: it is another method's or architecture's; nothing has changed then.
+        """
+        check_state(self.name, self.state(), state)
+        self.target_scale = float(state['target_scale'])
+
+    def _require_prepared(self) -> None:
+        if not self.target_scale:
+            raise RewardModelError(
+                f'method {self.name!r} has no target scale yet: '
+                'call prepare(memory) before it is trained or asked'
+            )
+
+    @property
+    def _unit(self) -> float:
+        """What labels are in units of, in the task's unit."""
+        return self.target_scale if self._settings.reward_unit == 'scaled' else 1.0
+
+
+def segment_steps(batch: SegmentBatch) -> NDArray[np.bool_]:
+    """Which steps (B, L) of a batch are its segments' own: neither context nor padding."""
+    step = np.arange(batch.actions.shape[1])
+    inside: NDArray[np.bool_] = (step >= batch.context[:, None]) & (step < batch.lengths[:, None])
+    return inside
+
+
+def check_state(
+    method: str, expected: Mapping[str, torch.Tensor], given: Mapping[str, torch.Tensor]
+) -> None:
+    """Refuse a state that is not one of this very method and architecture.
+
+    Args:
+        method: whose state is expected, for the error.
+        expected: a state of it, for names, shapes and types.
+        given: the state to be loaded.
+
+    Raises:
+        RewardModelError: a tensor is missing, unknown, of another shape or type, or not finite.
+    """
+    wrong = [f'{name} is missing' for name in expected if name not in given]
+    wrong += [f'{name} is unknown' for name in given if name not in expected]
+    for name, tensor in given.items():
+        if name not in expected:
+            continue
+        want = expected[name]
+        if (tensor.shape, tensor.dtype) != (want.shape, want.dtype):
+            wrong.append(
+                f'{name} is {tuple(tensor.shape)} {tensor.dtype}, '
+                f'expected {tuple(want.shape)} {want.dtype}'
+            )
+        elif tensor.is_floating_point() and not bool(tensor.isfinite().all()):
+            wrong.append(f'{name} has values that are not finite')
+    if wrong:
+        more = f' and {len(wrong) - 5} more' if len(wrong) > 5 else ''
+        raise RewardModelError(
+            f'state of reward method {method!r} refused: {"; ".join(wrong[:5])}{more}. '
+            f'It belongs to other settings or another task: use those it was saved with'
+        )

@@ -1,0 +1,44 @@
+"""Reward methods: from composite rewards to step rewards, each behind the same small protocol."""
+
+from codetr_ros.config import Settings
+from codetr_ros.rewards.base import RewardMethod, RewardModelError
+from codetr_ros.rewards.codetr import Codetr
+from codetr_ros.rewards.ircr import Ircr
+from codetr_ros.rewards.mlp import Mlp
+from codetr_ros.rewards.rbt import Rbt
+from codetr_ros.rewards.redistribution import LastStep, Ones, TrueReward, Uniform
+from codetr_ros.rewards.rrd import Rrd
+
+METHODS: dict[str, type[RewardMethod]] = {
+    method.name: method
+    for method in (Codetr, LastStep, Rbt, Rrd, Ircr, Mlp, Uniform, TrueReward, Ones)
+}
+"""Reward methods by the name that `settings.method` gives them."""
+
+
+def kind(settings: Settings) -> type[RewardMethod]:
+    """The reward method that the settings name.
+
+    Raises:
+        RewardModelError: there is no such method.
+    """
+    if settings.method not in METHODS:
+        raise RewardModelError(
+            f'method = {settings.method!r}: there is no such reward method; '
+            f'choose one of {", ".join(METHODS)}'
+        )
+    return METHODS[settings.method]
+
+
+def make(settings: Settings, observation_size: int, action_size: int) -> RewardMethod:
+    """Make the reward method that the settings name.
+
+    Args:
+        settings: the run's settings.
+        observation_size: O of the task.
+        action_size: A of the task.
+
+    Raises:
+        RewardModelError: there is no such method.
+    """
+    return kind(settings)(settings, observation_size, action_size)

@@ -1,0 +1,211 @@
+"""Checkpoints: a folder of two files, written whole or not at all, hashed, without pickle.
+
+    <folder>/<name>-<phase>/tensors.safetensors    weights, optimiser moments, labels: all tensors
+    <folder>/<name>-<phase>/checkpoint.json        everything else, with the sha256 of both files
+
+A checkpoint is written under a hidden temporary name, synced and renamed; only then are older ones
+removed. So there is always a whole one to return to. What is missing or damaged is refused, never
+silently replaced by a fresh start.
+"""
+
+import hashlib
+import json
+import os
+import re
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.torch
+import torch
+
+from codetr_ros.system.files import (sync_folder, write_synced)
+
+TENSORS = 'tensors.safetensors'
+DESCRIPTION = 'checkpoint.json'
+FORMAT = 1
+"""Raised whenever the layout of a checkpoint changes its meaning."""
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that cannot be written or must not be read: names file, hashes and remedy."""
+
+
+def digest(tensors: Mapping[str, torch.Tensor]) -> str:
+    """sha256 over names (sorted), dtypes, shapes and bytes: equal weights give equal digests."""
+    total = hashlib.sha256()
+    for name in sorted(tensors):
+        tensor = tensors[name].detach().cpu().contiguous()
+        # A JSON line before the bytes, so that neither names nor shapes can run into each other or
+        # into the values.
+        total.update(json.dumps([name, str(tensor.dtype), list(tensor.shape)]).encode() + b'\n')
+        total.update(_bytes(tensor))
+    return total.hexdigest()
+
+
+def _bytes(tensor: torch.Tensor) -> bytes:
+    # Through uint8: numpy has no bfloat16. The reshape before it is because a 0-dimensional tensor
+    # has no byte view.
+    flat = tensor.reshape(-1).view(torch.uint8).numpy()
+    return bytes(np.ascontiguousarray(flat).data)
+
+
+def save(
+    folder: Path,
+    name: str,
+    phase: int,
+    tensors: Mapping[str, torch.Tensor],
+    meta: Mapping[str, Any],
+    keep: int = 3,
+) -> Path:
+    """Write a checkpoint, then remove all but the newest `keep` of this name.
+
+    Args:
+        folder: where checkpoints lie; made if it is missing.
+        name: whose checkpoint it is: letters, digits, `_`, `.`, `-`.
+        phase: after which phase of the run; one that exists for it is replaced.
+        tensors: all state that is tensors, on any device.
+        meta: all state that is not: JSON-able, numbers finite.
+        keep: how many to keep, at least 1.
+
+    Returns:
+        The checkpoint's folder.
+
+    Raises:
+        CheckpointError: a name, phase, `keep` or `meta` that cannot be written; nothing has
+            changed then.
+        OSError: disk full or not writable; the older checkpoints are untouched then.
+    """
+    if not re.fullmatch(r'[A-Za-z0-9_][A-Za-z0-9_.-]*', name):
+        raise CheckpointError(f'checkpoint name {name!r}: use letters, digits, "_", "." and "-"')
+    if phase < 0 or keep < 1:
+        raise CheckpointError(
+            f'checkpoint {name}: phase={phase} must be >= 0 and keep={keep} must be >= 1'
+        )
+    # Own copies: safetensors refuses tensors that share memory, as views of one flat parameter do.
+    copies = {
+        key: value.detach().cpu().clone(memory_format=torch.contiguous_format)
+        for key, value in tensors.items()
+    }
+    data = safetensors.torch.save(copies)
+    body = {
+        'format': FORMAT,
+        'name': name,
+        'phase': phase,
+        'digest': digest(copies),
+        'tensors_sha256': hashlib.sha256(data).hexdigest(),
+        'meta': dict(meta),
+    }
+    try:
+        description = _describe(body)
+    except (TypeError, ValueError) as error:
+        raise CheckpointError(
+            f'checkpoint {name}, phase {phase}: meta cannot be written as JSON: {error}'
+        ) from None
+
+    folder.mkdir(parents=True, exist_ok=True)
+    _remove_partial(folder, name)
+    path = folder / f'{name}-{phase:06d}'
+    partial = folder / f'.{name}-{phase:06d}.partial'
+    partial.mkdir()
+    write_synced(partial / TENSORS, data)
+    write_synced(partial / DESCRIPTION, description)
+    sync_folder(partial)
+    if path.exists():
+        # A folder that is not empty cannot be renamed over. The name counts as partial: if the
+        # machine stops between the two renames, the next older checkpoint is the latest.
+        os.replace(path, folder / f'.{name}-{phase:06d}.replaced.partial')
+    os.replace(partial, path)
+    sync_folder(folder)
+    _remove_partial(folder, name)
+    for old in _all(folder, name)[:-keep]:
+        if old != path:  # after a return to an earlier phase the newest need not be the highest
+            shutil.rmtree(old)
+    return path
+
+
+def load(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Read a checkpoint after verifying the sha256 of both of its files.
+
+    Returns:
+        The tensors (on the CPU, in memory of their own) and the `meta` that were saved.
+
+    Raises:
+        CheckpointError: a file is missing or damaged, or of another format: names it, both hashes
+            and the remedy.
+    """
+    remedy = f'remove {path} to continue from an older checkpoint, or restore it from a copy'
+    content = {}
+    for file in (DESCRIPTION, TENSORS):
+        try:
+            content[file] = (path / file).read_bytes()
+        except OSError as error:
+            raise CheckpointError(
+                f'checkpoint file {path / file} cannot be read ({error.strerror}): {remedy}'
+            ) from error
+
+    try:
+        description = json.loads(content[DESCRIPTION])
+        said = description.pop('sha256')
+        found = hashlib.sha256(_canonical(description)).hexdigest()
+    except (ValueError, TypeError, AttributeError, KeyError) as error:
+        found = hashlib.sha256(content[DESCRIPTION]).hexdigest()
+        raise CheckpointError(
+            f'checkpoint file {path / DESCRIPTION} is damaged: not a description with its sha256 '
+            f'({type(error).__name__}: {error}; the file has sha256 {found}): {remedy}'
+        ) from None
+    if said != found:
+        raise CheckpointError(_damaged(path / DESCRIPTION, found, said, remedy))
+    if description.get('format') != FORMAT:
+        raise CheckpointError(
+            f'checkpoint {path} has format {description.get("format")!r}, but this version reads '
+            f'{FORMAT}: read it with the version that wrote it'
+        )
+    found, said = hashlib.sha256(content[TENSORS]).hexdigest(), description['tensors_sha256']
+    if said != found:
+        raise CheckpointError(_damaged(path / TENSORS, found, said, remedy))
+    return safetensors.torch.load(content[TENSORS]), description['meta']
+
+
+def latest(folder: Path, name: str) -> Path | None:
+    """The whole checkpoint of this name with the highest phase, or None; `load` verifies it."""
+    found = _all(folder, name)
+    return found[-1] if found else None
+
+
+def _damaged(file: Path, found: str, said: str, remedy: str) -> str:
+    return f'checkpoint file {file} is damaged: sha256 is {found}, should be {said}: {remedy}'
+
+
+def phase_of(path: Path) -> int:
+    """The phase after which the checkpoint in this folder was written."""
+    return int(path.name.rsplit('-', 1)[1])
+
+
+def _all(folder: Path, name: str) -> list[Path]:
+    """All whole checkpoints of exactly this name, lowest phase first."""
+    if not folder.is_dir():
+        return []
+    pattern = re.compile(re.escape(name) + r'-\d{6,}')
+    return sorted((p for p in folder.iterdir() if pattern.fullmatch(p.name)), key=phase_of)
+
+
+def _remove_partial(folder: Path, name: str) -> None:
+    """Remove what a process that was killed while saving left behind."""
+    pattern = re.compile(r'\.' + re.escape(name) + r'-\d{6,}(\.replaced)?\.partial')
+    for path in folder.iterdir():
+        if pattern.fullmatch(path.name):
+            shutil.rmtree(path)
+
+
+def _canonical(body: Mapping[str, Any]) -> bytes:
+    return json.dumps(body, sort_keys=True, allow_nan=False, separators=(',', ':')).encode()
+
+
+def _describe(body: Mapping[str, Any]) -> bytes:
+    canonical = _canonical(body)
+    complete = {**json.loads(canonical), 'sha256': hashlib.sha256(canonical).hexdigest()}
+    return (json.dumps(complete, indent=2) + '\n').encode()

@@ -1,0 +1,172 @@
+"""The folder of a run: what lies where in it."""
+
+import json
+import os
+import re
+from pathlib import Path
+from typing import Any
+import yaml
+from codetr_ros import config
+from codetr_ros.system.files import atomic_write
+
+CONFIG = 'config.yaml'
+
+
+BAG = 'bag'
+
+
+CHECKPOINTS = 'checkpoints'
+
+
+NODES = 'nodes'
+
+
+LOGS = 'logs'
+
+
+SUMMARY = 'summary.json'
+
+
+METRICS = 'metrics.csv'
+
+
+REPORT = 'report.html'
+
+
+PICTURE = 'learning_curve.png'
+
+
+class RunFolderError(ValueError):
+    """A folder that cannot hold a run, or that does not hold one: names it and says what to do."""
+
+
+def check(path: Path) -> None:
+    """Say whether `create` would accept this folder, without making anything.
+
+    Raises:
+        RunFolderError: it exists and is not empty, is not a folder, or cannot be written.
+    """
+    if path.exists():
+        if not path.is_dir():
+            raise RunFolderError(f'output folder {path} is a file: choose another with --out')
+        if not os.access(path, os.W_OK | os.X_OK):
+            raise RunFolderError(
+                f'output folder {path} cannot be written: change its permissions '
+                'or choose another with --out'
+            )
+        if found := sorted(entry.name for entry in path.iterdir()):
+            shown = ', '.join(found[:3]) + (', ...' if len(found) > 3 else '')
+            raise RunFolderError(
+                f'output folder {path} exists and is not empty ({shown}): '
+                'choose another with --out, or remove it'
+            )
+        return
+    parent = path.absolute().parent
+    while not parent.exists():
+        parent = parent.parent
+    if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
+        raise RunFolderError(
+            f'output folder {path} cannot be made, {parent} cannot be written: '
+            'change its permissions or choose another with --out'
+        )
+
+
+def create(path: Path) -> Path:
+    """Make the folder of a new run, with the folders in it that every run has.
+
+    Returns:
+        The absolute path.
+
+    Raises:
+        RunFolderError: it exists and is not empty, or it cannot be written.
+    """
+    check(path)
+    folder = path.absolute()
+    try:
+        for name in (NODES, LOGS, CHECKPOINTS):
+            (folder / name).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunFolderError(
+            f'output folder {path} cannot be made ({error.strerror}): choose another with --out'
+        ) from error
+    return folder
+
+
+def bag_of(path: Path) -> Path:
+    """The bag in a run's folder; any other path as it is."""
+    inside = path / BAG
+    return inside if (path / CONFIG).is_file() and inside.is_dir() else path
+
+
+def write_settings(folder: Path, settings: config.Settings) -> Path:
+    """Write every setting to the run's `config.yaml`, from which `config.load` reads them."""
+    path = folder / CONFIG
+    text = yaml.safe_dump(settings.model_dump(mode='json'), sort_keys=False)
+    note = f'# Every setting of this run: `codetr train --config {CONFIG}` repeats it.'
+    atomic_write(path, f'{note}\n{text}')
+    return path
+
+
+def read_settings(folder: Path) -> config.Settings:
+    """The settings of the run whose folder this is.
+
+    Raises:
+        RunFolderError: there is no `config.yaml`, so this is not the folder of a run.
+        SettingsError: it holds settings that are refused.
+    """
+    path = folder / CONFIG
+    if not path.is_file():
+        raise RunFolderError(
+            f'{folder} is not the folder of a run, it has no {CONFIG}: '
+            'give the folder that `codetr train` named'
+        )
+    return config.load(str(path))
+
+
+def _file_name(text: str) -> str:
+    return re.sub(r'[^A-Za-z0-9_.]+', '_', text).strip('_') or 'unnamed'
+
+
+def report_path(folder: Path, role: str, name: str) -> Path:
+    """Where the node of this role and (fully qualified or plain) name leaves its report."""
+    return folder / NODES / f'{role}-{_file_name(name.rsplit("/", 1)[-1])}.json'
+
+
+def write_report(folder: Path, role: str, name: str, report: dict[str, Any]) -> Path:
+    """Write what a node did to `nodes/<role>-<name>.json`.
+
+    Args:
+        folder: the run's folder.
+        role: one of `records.ROLES`.
+        name: node name; of a fully qualified one the last part becomes the file's name.
+        report: JSON-able; `role` and `name` are added where missing.
+    """
+    path = report_path(folder, role, name)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    atomic_write(path, json.dumps({'role': role, 'name': name} | report, indent=2) + '\n')
+    return path
+
+
+def read_report(path: Path) -> dict[str, Any]:
+    """One node's report.
+
+    Raises:
+        RunFolderError: it is not a JSON object.
+    """
+    try:
+        report = json.loads(path.read_text())
+    except ValueError as error:
+        raise RunFolderError(f'node report {path} is not JSON ({error})') from None
+    if not isinstance(report, dict):
+        raise RunFolderError(f'node report {path} holds {type(report).__name__}, not an object')
+    return report
+
+
+def read_reports(folder: Path) -> dict[str, dict[str, Any]]:
+    """All node reports that are there, by `<role>-<name>`.
+
+    Raises:
+        RunFolderError: one of them is damaged.
+    """
+    return {path.stem: read_report(path) for path in sorted((folder / NODES).glob('*.json'))}
+

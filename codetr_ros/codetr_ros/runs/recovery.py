@@ -1,0 +1,183 @@
+"""Reward recovery over a run: do the labels of the day agree with the true step rewards?
+
+An observer, of a run in process while it goes on, of a run over topics by its bag. Nothing comes
+back from it: neither learner nor reward model can see what it sees.
+"""
+
+import numpy as np
+
+from codetr_ros.config import Settings
+from codetr_ros.records import (F32, I64, Record, StepRewards, TrueRewards)
+
+
+class RecoveryError(ValueError):
+    """Labels that cannot be compared: some of the true rewards are not there; says whose."""
+
+
+class _Source:
+    """The newest steps of one source, in a ring: row r lies in slot r % capacity."""
+
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._episode, self._steps = -1, 0  # the newest episode, and its steps so far
+        # np.empty takes memory page by page as steps arrive, not at once
+        self._true = np.empty(capacity, np.float32)
+        self._labels = np.empty(capacity, np.float32)  # NaN: not labelled
+        self._versions = np.empty(capacity, np.uint32)  # of the model that labelled
+        self._segments = np.empty(capacity, np.int64)  # row of the segment's first step
+        self._rows = np.zeros(64, np.int64)  # by episode: the row of its first step
+        self._end = 0
+
+    def append(self, record: TrueRewards) -> None:
+        """Steps that follow on those before.
+
+        Raises:
+            RecoveryError: they do not.
+        """
+        due = (self._episode, self._steps) if record.first_step else (self._episode + 1, 0)
+        if (record.episode, record.first_step) != due:
+            raise RecoveryError(
+                f'of {record.source!r} true rewards are missing before episode {record.episode}, '
+                f'step {record.first_step}: those before end with episode {self._episode}, '
+                f'{self._steps} steps'
+            )
+        self._episode, self._steps = record.episode, record.first_step + len(record.rewards)
+        if record.episode >= len(self._rows):
+            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
+        if record.first_step == 0:
+            self._rows[record.episode] = self._end
+        rewards = record.rewards[-self._capacity :]
+        self._end += len(record.rewards)
+        slots = np.arange(self._end - len(rewards), self._end) % self._capacity
+        self._true[slots] = rewards
+        self._labels[slots] = np.nan
+
+    def label(self, record: StepRewards) -> None:
+        """Labels of segments; those of steps that are no longer held are left out.
+
+        Steps are labelled with their whole segment the first time, and maybe some of them later.
+
+        Raises:
+            RecoveryError: for steps without true rewards.
+        """
+        lengths = record.lengths.astype(np.int64)
+        last = np.lexsort((record.first_steps, record.episodes))[-1]
+        end = int(record.episodes[last]), int(record.first_steps[last] + lengths[last])
+        if end > (self._episode, self._steps):
+            raise RecoveryError(
+                f'of {record.source!r} there are labels up to episode {end[0]}, {end[1]} steps, '
+                f'and true rewards up to episode {self._episode}, {self._steps} steps'
+            )
+        firsts = self._rows[record.episodes] + record.first_steps
+        segments = np.repeat(firsts, lengths)
+        within = np.arange(len(segments)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+        rows = segments + within
+        held = rows >= self._end - self._capacity
+        slots = rows[held] % self._capacity
+        first = np.isnan(self._labels[slots])
+        self._segments[slots[first]] = segments[held][first]
+        self._labels[slots] = record.labels[held]
+        self._versions[slots] = record.version
+
+    def labelled(self, version: int | None) -> tuple[F32, F32, I64]:
+        """Labels, true rewards and segments (T,) of the steps that have a label, of this version
+        if one is given.
+        """
+        held = slice(min(self._end, self._capacity))
+        there = ~np.isnan(self._labels[held])
+        if version is not None:
+            there &= self._versions[held] == version
+        return self._labels[held][there], self._true[held][there], self._segments[held][there]
+
+
+class Recovery:
+    """Compares labels and true rewards whenever a policy is due for evaluation.
+
+    What is compared is what the policy learns from: labels of the newest `memory_steps` steps up
+    to the phase of the labels; where all of the memory is labelled again in each phase, those of
+    the newest version only, as others belong to steps that have left it. They take 20 bytes each.
+    True rewards may come before labels of earlier phases: as many phases as the run's simulators
+    may be ahead of its learner, or any number where they are recorded.
+
+    Args:
+        settings: the run's settings.
+        recorded: the labels are those of the run's bag, which may lack some (`record_relabels`).
+            What lacks labels is not compared.
+    """
+
+    def __init__(self, settings: Settings, recorded: bool = False) -> None:
+        self._settings = settings
+        self._recorded = recorded
+        self._complete = True  # no label is lacking
+        self._version: int | None = None  # of the last labels
+        self._sources: dict[str, _Source] = {}
+        self._coming: list[TrueRewards] = []  # of phases that are not labelled yet
+        self.rows: list[dict[str, float]] = []
+        """For each evaluation with labels: `step`, `pearson`, `within` (Pearson after each
+        segment's mean was taken from both), `spearman` (NaN where one side does not vary), and
+        `steps`, how many were compared."""
+
+    def receive(self, record: Record) -> None:
+        """Take note of a record of the run, of whatever kind.
+
+        Raises:
+            RecoveryError: there are labels, but not all of the true rewards.
+        """
+        if isinstance(record, TrueRewards):
+            if not self._recorded:
+                # those are labelled, if ever: of a run without labels none may wait for good
+                self._take_in(record.phase - self._settings.lag)
+            self._coming.append(record)
+        elif isinstance(record, StepRewards):
+            self._take_in(record.phase)
+            self._note_version(record)
+            if len(record.lengths):
+                if record.source not in self._sources:
+                    raise RecoveryError(f'{record.source!r} told no true rewards')
+                self._sources[record.source].label(record)
+            if record.part == record.parts - 1 and self._settings.evaluated(record.phase):
+                self._compare(self._settings.steps_after(record.phase), record.version)
+
+    def _note_version(self, record: StepRewards) -> None:
+        """Another version labels again what has a label: a bag has that of evaluations only. What
+        has none yet it has in any case.
+        """
+        if record.version != self._version and self._version is not None:
+            whole = self._settings.evaluated(record.phase) and self._settings.relabels_all
+            self._complete = whole or not self._recorded or self._settings.record_relabels == 'all'
+        self._version = record.version
+
+    def _take_in(self, phase: int) -> None:
+        """True rewards of the phases up to this one."""
+        come, self._coming = self._coming, []
+        for record in come:
+            if record.phase > phase:
+                self._coming.append(record)
+                continue
+            if record.source not in self._sources:
+                share = self._settings.memory_steps // self._settings.source_count
+                self._sources[record.source] = _Source(max(1, share))
+            self._sources[record.source].append(record)
+
+    def _compare(self, step: int, version: int) -> None:
+        if not self._complete:
+            return
+        from codetr_ros.runs.recovery_metrics import flat_recovery  # scipy takes a second to import
+
+        only = version if self._settings.relabels_all else None
+        found = [source.labelled(only) for _, source in sorted(self._sources.items())]
+        # the segments of several sources must not share a number
+        far = np.int64(1) << 40
+        labels, true = (np.concatenate([each[i] for each in found]) for i in (0, 1))
+        segments = np.concatenate([each[2] + i * far for i, each in enumerate(found)])
+        if len(labels):
+            said = flat_recovery(labels, true, segments)
+            self.rows.append(
+                {
+                    'step': step,
+                    'pearson': said['pearson'],
+                    'within': said['within_pearson'],
+                    'spearman': said['spearman'],
+                    'steps': len(labels),
+                }
+            )

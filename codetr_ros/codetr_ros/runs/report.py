@@ -1,0 +1,183 @@
+"""The report of a run for people: a picture of the learning curve and one HTML page."""
+
+import base64
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from codetr_ros.runs import folder as run_folder
+from codetr_ros.system.files import atomic_write
+from codetr_ros.runs.pages import (STYLE, flat, records, table, text)
+
+_TRUE, _SCORE = '#1f5fa8', '#b8561c'
+
+
+def title(summary: Mapping[str, Any]) -> str:
+    """What run it was, in a line."""
+    said = '{task}, {composite} of {delay} steps, {method}, seed {seed}'.format(**summary)
+    return said + (' (interrupted)' if summary['interrupted'] else '')
+
+
+def draw(summary: Mapping[str, Any]) -> bytes:
+    """The learning curve as a PNG: true return and score of each evaluation against steps.
+
+    The bands show the spread over an evaluation's episodes: from the worst to the best for the
+    true return, a standard deviation for the score. The dashed lines are the random policy.
+    """
+    # Without pyplot: no display, no state that outlives the picture, and half the import time.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    rows, random = summary['evaluations'], summary['random']
+    figure = Figure(figsize=(8, 6), dpi=120, layout='constrained')
+    FigureCanvasAgg(figure)
+    figure.suptitle(title(summary), fontsize=11)
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
+    upper.set_ylabel('true return of an episode')
+    lower.set_ylabel('score\n(composite return / perfect)')
+    lower.set_xlabel('environment steps')
+    lower.set_xlim(0, summary['steps_planned'])
+
+    def column(name: str) -> list[float]:
+        return [row[name] for row in rows]
+
+    score, std = column('score_mean'), column('score_std')
+    for axes, colour, mean, low, high, name in (
+        (
+            upper,
+            _TRUE,
+            column('true_return_mean'),
+            column('true_return_min'),
+            column('true_return_max'),
+            'true_return_mean',
+        ),
+        (
+            lower,
+            _SCORE,
+            score,
+            [m - s for m, s in zip(score, std, strict=True)],
+            [m + s for m, s in zip(score, std, strict=True)],
+            'score_mean',
+        ),
+    ):
+        axes.grid(alpha=0.3)
+        if rows:
+            steps = column('step')
+            spread = 'worst to best' if axes is upper else 'standard deviation'
+            axes.fill_between(steps, low, high, color=colour, alpha=0.15, lw=0, label=spread)
+            axes.plot(steps, mean, 'o-', color=colour, markersize=4, label='mean')
+        else:
+            axes.text(0.5, 0.5, 'no evaluation', transform=axes.transAxes, ha='center')
+        if random:
+            axes.axhline(random[name], color='#555', ls='--', lw=1, label='random policy')
+        if rows or random:
+            axes.legend(loc='best', fontsize=8, framealpha=0.8)
+    picture = io.BytesIO()
+    figure.savefig(picture, format='png')
+    return picture.getvalue()
+
+
+def page(summary: Mapping[str, Any], picture: bytes) -> str:
+    """The HTML page, with everything in it."""
+    shown = base64.b64encode(picture).decode()
+    parts = [
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">',
+        f'<title>{text(title(summary))}</title><style>{STYLE}</style></head><body>',
+        f'<h1>{text(title(summary))}</h1>',
+        f'<p class="bad">{text(summary["failure"])}</p>' if summary['failure'] else '',
+        f'<img alt="learning curve" src="data:image/png;base64,{shown}">',
+        '<h2>Result</h2>',
+        table(['', ''], [[name, value] for name, value in result_rows(summary)]),
+        '<p>The score is the composite return of an episode over that of an agent that earns the '
+        "task's largest reward at every step.</p>",
+        '<h2>Evaluations</h2>',
+        records(([summary['random']] if summary['random'] else []) + summary['evaluations']),
+        '<h2>Messages</h2>',
+        _messages(summary['messages']),
+        '<h2>Processes</h2>',
+        records([{'process': name, **row} for name, row in summary['processes'].items()]),
+        '<h2>Settings</h2>',
+        table(['setting', 'value'], list(flat(summary['settings']))),
+        '<h2>Identity</h2>',
+        table(
+            ['', ''],
+            [
+                [name, summary[name]]
+                for name in ('run_id', 'policy_sha256', 'reward_model_sha256', 'settings_hash')
+            ]
+            + [[f'version of {name}', value] for name, value in summary['versions'].items()],
+        ),
+        '</body></html>\n',
+    ]
+    return '\n'.join(part for part in parts if part)
+
+
+def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The few numbers that people look for first, for the page and for the terminal."""
+
+    def number(value: float | None, form: str) -> str:
+        return 'not evaluated' if value is None else format(value, form)
+
+    last = summary['evaluations'][-1] if summary['evaluations'] else None
+    spread = f' +- {last["true_return_std"]:.1f}' if last else ''
+    after = f' after {last["step"]} steps' if last else ''
+    return [
+        ('score', f'{number(summary["final_score"], ".3f")}{after}'),
+        ('score of the random policy', number(summary['random_score'], '.3f')),
+        ('true return', f'{number(summary["final_true_return"], ".1f")}{spread}'),
+        ('true return of the random policy', number(summary['random_true_return'], '.1f')),
+        ('reward recovery', _recovery(summary)),
+        ('steps', f'{summary["steps"]} of {summary["steps_planned"]}'),
+        ('phases', f'{summary["phases"]} of {summary["phases_planned"]}'),
+        ('time', f'{summary["wall_s"]:.1f} s, {summary["steps_per_s"] or 0:.0f} steps per second'),
+        (
+            'messages',
+            f'{sum(row["published"] for row in summary["messages"].values())} published, '
+            + ', '.join(
+                f'{summary[fault]} {fault}' for fault in ('lost', 'duplicated', 'refused')
+            ),
+        ),
+    ]
+
+
+def _recovery(summary: Mapping[str, Any]) -> str:
+    """How well step rewards agreed with the true ones when they were last compared."""
+    rows, evaluations = summary['reward_recovery'], summary['evaluations']
+    if not rows:
+        return 'no labels were compared'
+    said = {'pearson': 'correlation', 'within': 'within segments'}
+    found = [
+        f'{name} {rows[-1][key]:.2f}' for key, name in said.items() if rows[-1][key] is not None
+    ]
+    late = bool(evaluations) and evaluations[-1]['step'] != rows[-1]['step']
+    after = f', after {rows[-1]["step"]} steps' if late else ''
+    return (', '.join(found) or 'not defined where one side does not vary') + after
+
+
+_BARS = ' ▁▂▃▄▅▆▇█'
+
+
+def sketch(values: Sequence[float], encoding: str | None) -> str:
+    """A learning curve in a line of text: one bar for each value, the highest full."""
+    bars = _BARS
+    try:
+        bars.encode(encoding or 'ascii')
+    except (UnicodeEncodeError, LookupError):
+        bars = ' .:-=+*#@'
+    low, high = min(values), max(values)
+    top = len(bars) - 1
+    if high == low:
+        return bars[1] * len(values)
+    return ''.join(bars[1 + round((v - low) / (high - low) * (top - 1))] for v in values)
+
+
+def write(folder: Path, summary: Mapping[str, Any]) -> None:
+    """Write the picture and the page into a run's folder."""
+    picture = draw(summary)
+    atomic_write(folder / run_folder.PICTURE, picture)
+    atomic_write(folder / run_folder.REPORT, page(summary, picture))
+
+
+def _messages(messages: Mapping[str, Mapping[str, int]]) -> str:
+    return records([{'topic': topic, **row} for topic, row in messages.items()])

@@ -1,0 +1,121 @@
+"""Episodes, step by step: cut into segments and scored as they go.
+
+Simulators and the evaluator share this code, so that a score means the same in both.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from codetr_ros.config import Settings
+from codetr_ros.records import (
+    F32,
+    EpisodeResult,
+)
+from codetr_ros.simulation.composite import composite, perfect_score
+from codetr_ros.simulation.tasks import Environment, check, r_max
+
+
+@dataclass(frozen=True)
+class Score:
+    """The composite reward of the `length` steps that begin at `first_step` of their episode."""
+
+    first_step: int
+    length: int
+    value: float
+
+
+class Episode:
+    """One episode after another of an environment, each cut into segments from its start.
+
+    An episode ends in a terminal state (`terminated`) or at the horizon (`truncated`); one that
+    reaches a terminal state with its last step at the horizon is terminated only. Its last segment
+    may be shorter and is scored too.
+
+    Args:
+        environment: the environment; this object steps it and nothing else may.
+        settings: composite, beta, delay and r_max.
+
+    Raises:
+        SettingsError: the delay exceeds the horizon.
+    """
+
+    def __init__(self, environment: Environment, settings: Settings) -> None:
+        check(settings, environment)
+        self._environment = environment
+        self._settings = settings
+        self._perfect = perfect_score(
+            settings.composite,
+            settings.beta,
+            settings.delay,
+            environment.horizon,
+            r_max(settings, environment),
+        )
+        self._rewards = np.zeros(environment.horizon, np.float64)
+        self.terminated = False
+        self.truncated = True  # nothing runs yet: begin with `reset`
+        self.observation: F32 = np.zeros(environment.observation_size, np.float32)
+        self.length = 0
+        self._first_step = 0  # of the segment that runs
+        self._due = 0  # length at which it is to be scored, unless the episode ends before
+        self._composite_return = 0.0
+
+    @property
+    def over(self) -> bool:
+        """Whether the episode has ended, so that `reset` is due."""
+        return self.terminated or self.truncated
+
+    def reset(self, seed: int) -> None:
+        """Start another episode from the start that `seed` stands for."""
+        self.observation = self._environment.reset(seed)
+        self.terminated = self.truncated = False
+        self.length = self._first_step = 0
+        self._due = self._end_of_segment()
+        self._composite_return = 0.0
+
+    def _end_of_segment(self) -> int:
+        return min(self._first_step + self._settings.delay, self._environment.horizon)
+
+    def step(self, action: F32) -> tuple[float, Score | None]:
+        """Take an action (A,) in [-1, 1].
+
+        Returns:
+            The environment's reward, and the score of the segment that the step completed or cut
+            short, if any.
+
+        Raises:
+            TaskError: the environment gave something that is not finite.
+            CompositeError: the segment's composite reward is not finite.
+        """
+        self.observation, reward, self.terminated = self._environment.step(action)
+        self._rewards[self.length] = reward
+        self.length += 1
+        if self.length < self._due and not self.terminated:
+            return reward, None
+        self.truncated = self.length == self._environment.horizon and not self.terminated
+        first, settings = self._first_step, self._settings
+        segment = self._rewards[first : self.length]
+        value = composite(settings.composite, segment, settings.beta, settings.delay)
+        score = Score(first, len(segment), value)
+        self._first_step = self.length
+        self._due = self._end_of_segment()
+        self._composite_return += score.value
+        return reward, score
+
+    def result(
+        self, run_id: str, source: str, purpose: str, step: int, version: int, episode: int
+    ) -> EpisodeResult:
+        """How the episode went. `source` to `episode` are the fields of the record."""
+        return EpisodeResult(
+            run_id,
+            source,
+            purpose,
+            step,
+            version,
+            episode,
+            self.length,
+            float(self._rewards[: self.length].sum()),
+            self._composite_return,
+            self._composite_return / self._perfect,
+            self.terminated,
+        )

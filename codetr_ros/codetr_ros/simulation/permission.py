@@ -1,0 +1,60 @@
+"""What a simulator and the evaluator check of a policy before they act under it."""
+
+from codetr_ros.config import Settings
+from codetr_ros.policy.acting import ActingPolicy, NetworkError
+from codetr_ros.records import INITIAL_VERSION, Policy, Record, RecordError, RunSpec, describe
+from codetr_ros.records.checks import check_run
+from codetr_ros.simulation.tasks import Environment
+
+
+def check_policy(policy: Record, run: RunSpec, settings: Settings, receiver: str) -> Policy:
+    """Refuse what is not a policy of this run.
+
+    Raises:
+        RecordError: another kind of record, another run, steps that do not match the sources, a
+            phase or version that the run does not have.
+    """
+    if not isinstance(policy, Policy):
+        raise RecordError(
+            f'{receiver} takes policies only, not {describe(policy)}: remove this subscription'
+        )
+    check_run(policy, run)
+    if len(policy.steps) != len(policy.sources):
+        raise RecordError(
+            f'{describe(policy)}: steps has {len(policy.steps)} entries for '
+            f'{len(policy.sources)} sources ({", ".join(policy.sources)}): the learner must give '
+            'each source its steps'
+        )
+    last = settings.phases - 1
+    if not (
+        0 <= policy.phase <= last + settings.lag and INITIAL_VERSION <= policy.version <= last
+    ):
+        raise RecordError(
+            f'{describe(policy)}: this run has phase 0 to {last + settings.lag} and version '
+            f'{INITIAL_VERSION} to {last}: the learner must number them so'
+        )
+    return policy
+
+
+def acting_policy(policy: Policy, environment: Environment, delay: int) -> ActingPolicy | None:
+    """The policy to act with in an environment; None for the uniformly random one.
+
+    Args:
+        policy: what the learner published.
+        environment: what it is to act in.
+        delay: steps n of a segment.
+
+    Raises:
+        RecordError: the weights are of another architecture or for other segments, missing or not
+            finite.
+    """
+    if policy.random:
+        return None
+    try:
+        return ActingPolicy.from_record(
+            policy, environment.observation_size, environment.action_size, delay
+        )
+    except NetworkError as error:
+        raise RecordError(
+            f'{describe(policy)} cannot act in task {environment.name!r}: {error}'
+        ) from error

@@ -1,0 +1,206 @@
+"""A source: one environment, whose episodes become records, chunk by chunk."""
+
+from collections import Counter
+from collections.abc import Iterator
+
+import numpy as np
+
+from codetr_ros.config import Settings
+from codetr_ros.policy.acting import ActingPolicy, uniform_actions
+from codetr_ros.records import (
+    F32,
+    PROTOCOL_VERSION,
+    CompositeReward,
+    Policy,
+    Record,
+    RunSpec,
+    TaskSpec,
+    Transitions,
+    TrueRewards,
+)
+from codetr_ros.seeding import generator
+from codetr_ros.simulation.episode import Episode, Score
+from codetr_ros.simulation.tasks import TaskError, make, r_max
+
+CHUNK_BYTES = 200_000
+"""Most bytes of a chunk: the middleware's shared-memory segment holds 512 KB."""
+CHUNK_STEPS = 250
+"""Most steps of a chunk: bounds how long an environment's part of a slice of work takes."""
+
+
+def chunk_steps(observation_size: int, action_size: int) -> int:
+    """Most steps T of a chunk, so that (T+1, O) and (T, A) float32 fit; 0 if no step does."""
+    numbers = CHUNK_BYTES // 4
+    fitting = (numbers - observation_size) // (observation_size + action_size)
+    return max(0, min(CHUNK_STEPS, fitting))
+
+
+class Source:
+    """One episode after another of an environment of its own.
+
+    What it draws depends on the run's seed, its own name, the phase and the episode, and on
+    nothing else.
+
+    Args:
+        run: the run it belongs to.
+        settings: the settings of the run.
+        name: its name, which must differ from every other source's of the run.
+
+    Raises:
+        TaskError: the task is unknown or cannot be used.
+        SettingsError: the delay exceeds the task's horizon.
+    """
+
+    def __init__(self, run: RunSpec, settings: Settings, name: str) -> None:
+        self.name = name
+        self.environment = make(settings.task)
+        self.counters: Counter[str] = Counter()
+        self._run = run
+        self._settings = settings
+        self._episode = Episode(self.environment, settings)
+        sizes = self.environment.observation_size, self.environment.action_size
+        self._chunk_steps = chunk_steps(*sizes)
+        if not self._chunk_steps:
+            raise TaskError(
+                f'task {settings.task!r}: one step with {sizes[0]} observations and {sizes[1]} '
+                f'actions takes more than the {CHUNK_BYTES} bytes of a message: choose a task '
+                'with smaller observations'
+            )
+        self._episodes = -1  # the number of the one that runs
+        self._sequence = 0  # of the next chunk
+        self._scores = 0  # scores given so far: the sequence number of the next
+
+    def spec(self) -> TaskSpec:
+        """What is simulated."""
+        environment = self.environment
+        return TaskSpec(
+            self._run.run_id,
+            PROTOCOL_VERSION,
+            self.name,
+            self._settings.task,
+            environment.observation_size,
+            environment.action_size,
+            environment.horizon,
+            environment.control_period,
+            r_max(self._settings, environment),
+        )
+
+    def roll_out(self, policy: Policy, acting: ActingPolicy | None) -> Iterator[list[Record]]:
+        """Take the steps that a policy permits: the records of one chunk at a time, the chunk
+        first.
+
+        Args:
+            policy: the permission, which gives this source at least one step.
+            acting: the policy to act with; None acts uniformly at random.
+        """
+        steps = self.permitted(policy)
+        # for the whole phase at once: where its chunks begin and end does not change what is drawn
+        rng = generator(self._settings.seed, 'noise', self.name, policy.phase)
+        size = self.environment.action_size
+        draws = (
+            uniform_actions(rng, steps, size)
+            if acting is None
+            else rng.standard_normal((steps, size), dtype=np.float32)
+        )
+        taken, scores_before = 0, self._scores
+        while taken < steps:
+            if self._episode.over:
+                self._episodes += 1
+                seeds = generator(self._settings.seed, 'reset', self.name, self._episodes)
+                self._episode.reset(int(seeds.integers(2**31)))
+            done, records = self._chunk(policy, acting, draws[taken:], taken, scores_before)
+            taken += done
+            yield records
+
+    def permitted(self, policy: Policy) -> int:
+        """Steps that a policy permits this source."""
+        return int(policy.steps[policy.sources.index(self.name)])
+
+    def _chunk(
+        self,
+        policy: Policy,
+        acting: ActingPolicy | None,
+        draws: F32,
+        taken: int,
+        scores_before: int,
+    ) -> tuple[int, list[Record]]:
+        """One chunk: its number of steps, and its records.
+
+        Args:
+            policy: the permission.
+            acting: the policy to act with; None acts as drawn.
+            draws: (steps left in the phase, A) noise, or actions where the policy is random.
+            taken: steps of the phase taken before.
+            scores_before: scores given before the phase.
+        """
+        episode, environment = self._episode, self.environment
+        first_step = episode.length
+        most = min(len(draws), self._chunk_steps, environment.horizon - first_step)
+        observations = np.empty((most + 1, environment.observation_size), np.float32)
+        actions = draws[:most].copy()
+        rewards = np.empty(most, np.float32)
+        scores: list[Score] = []
+        observations[0] = episode.observation
+        t = 0
+        while t < most and not episode.over:
+            if acting is not None:
+                actions[t] = acting.act(episode.observation, draws[t], episode.length)
+            rewards[t], score = episode.step(actions[t])
+            t += 1
+            observations[t] = episode.observation
+            if score is not None:
+                scores.append(score)
+        run_id, source, number = self._run.run_id, self.name, self._episodes
+        sequence = self._sequence
+        phase_end = t == len(draws)
+        chunk = Transitions(
+            run_id,
+            source,
+            sequence,
+            policy.phase,
+            number,
+            first_step,
+            t,
+            observations[: t + 1],
+            actions[:t],
+            episode.terminated,
+            episode.truncated,
+            phase_end,
+            self._scores + len(scores) - scores_before if phase_end else 0,
+        )
+        records: list[Record] = [
+            chunk,
+            TrueRewards(run_id, source, sequence, policy.phase, number, first_step, rewards[:t]),
+        ]
+        for score in scores:
+            records.append(
+                CompositeReward(
+                    run_id,
+                    source,
+                    source,
+                    self._scores,
+                    number,
+                    score.first_step,
+                    score.length,
+                    score.value,
+                )
+            )
+            self._scores += 1
+        self._sequence += 1
+        self.counters.update(chunks=1, steps=t, scores=len(scores))
+        if episode.over:
+            self.counters['episodes'] += 1
+            step = self._steps_at(policy, taken + t)
+            records.append(
+                episode.result(run_id, source, 'training', step, policy.version, number)
+            )
+        return t, records
+
+    def _steps_at(self, policy: Policy, taken: int) -> int:
+        """Steps of the run, as if all sources were as far in the phase as this one."""
+        share = taken / self.permitted(policy)
+        return policy.phase * self._settings.phase_steps + round(share * int(policy.steps.sum()))
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.environment.close()

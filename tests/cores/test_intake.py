@@ -1,0 +1,159 @@
+"""What the consumers refuse at the door, and that they take in exactly what a commit names, in
+order.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from codetr_ros.cores.intake import Intake
+from codetr_ros.memory.trajectories import Trajectories
+from codetr_ros.records import RecordError
+from helpers.builders import (
+    ACTION,
+    OBSERVATION,
+    commit,
+    follow,
+    run,
+    score,
+    task_spec,
+    tiny,
+    transitions,
+)
+
+
+def intake(**changes) -> Intake:
+    settings = tiny(**changes)
+    return Intake(run(settings), settings, scores=True)
+
+
+def known(**changes) -> Intake:
+    made = intake(**changes)
+    made.receive(task_spec())
+    return made
+
+
+def memory() -> Trajectories:
+    return Trajectories(OBSERVATION, ACTION, 7, 1000, 1000)
+
+
+def last(number: int) -> np.ndarray:
+    return np.array([number], np.int64)
+
+
+NAN = np.array([[0, 0, 0]] * 3 + [[0, np.nan, 0]] + [[0, 0, 0]] * 2, np.float32)
+
+
+@pytest.mark.parametrize(
+    ('record', 'said'),
+    [
+        (
+            transitions(run_id='other'),
+            r"is of run 'other', this is run 'run'.*namespace of its own",
+        ),
+        (transitions(observations=NAN), r'observations\[3, 1\] is nan: all values must be finite'),
+        (transitions(actions=np.full((5, ACTION), np.inf, np.float32)), r'actions\[0, 0\] is inf'),
+        (
+            transitions(observations=np.zeros((6, OBSERVATION + 1), np.float32)),
+            r"observations have shape \(6, 4\), \(6, 3\) expected of task a task as 'sim'",
+        ),
+        (
+            transitions(steps=5, actions=np.zeros((4, ACTION), np.float32)),
+            r'actions have shape \(4, 2\), \(5, 2\)',
+        ),
+        (transitions(first_step=998), 'step 1003 lies beyond the horizon 1000'),
+        (transitions(source='stranger'), "'stranger' is no simulator of this run; these are: sim"),
+        (transitions(sequence=400), "out of sequence: .* 0 is the next of 'sim'"),
+        (score(value=float('nan')), 'value is nan: a composite reward must be finite'),
+        (score(length=8), 'length is 8: a segment has 1 to 7 steps'),
+        (score(length=0), 'length is 0'),
+        (score(run_id='other'), "is of run 'other'"),
+        (commit(run_id='other'), "is of run 'other'"),
+        (
+            task_spec(source='second'),
+            "'second' is one simulator too many: the run has simulators=1",
+        ),
+        (task_spec(protocol_version=99), "'sim' speaks protocol 99, this node 1"),
+        (task_spec(source='x', action_size=5), "'x' has action_size=5, 'sim' has 2"),
+    ],
+)
+def test_what_cannot_be_is_refused_by_name_value_and_source_and_changes_nothing(record, said):
+    it, m = known(), memory()
+    with pytest.raises(RecordError, match=said):
+        it.receive(record)
+    it.receive(transitions())
+    it.receive(commit())
+    assert it.take(0, m) and m.steps == 5
+
+
+def test_nothing_enters_the_memory_before_its_commit():
+    it, m = known(), memory()
+    it.receive(transitions())
+    assert not it.take(0, m) and m.steps == 0 and it.missing is None
+
+
+def test_what_belongs_to_a_later_phase_waits_outside():
+    it, m = known(), memory()
+    it.receive(transitions())
+    it.receive(transitions(sequence=1, first_step=5, phase=1, observations=follow(transitions())))
+    it.receive(commit())
+    assert it.take(0, m) and m.steps == 5
+    it.receive(commit(phase=1, transitions=last(1)))
+    assert it.take(1, m) and m.steps == 10
+
+
+def test_the_order_of_arrival_does_not_matter():
+    first = transitions()
+    second = transitions(sequence=1, first_step=5, observations=follow(first))
+    scored = score(first_step=0, length=7)
+    memories = []
+    for arrival in ([first, second, scored], [scored, second, first], [second, first, scored]):
+        it, m = intake(), memory()
+        for record in (*arrival, commit(transitions=last(1), scores=last(0)), task_spec()):
+            it.receive(record)
+        assert it.take(0, m)
+        memories.append(m.segment_batch(m.segment_ids()))
+    for other in memories[1:]:
+        np.testing.assert_array_equal(other.observations, memories[0].observations)
+
+
+def test_a_commit_whose_steps_have_not_all_arrived_is_missing_until_they_have():
+    it, m = known(), memory()
+    it.receive(transitions())
+    it.receive(commit(transitions=last(1)))
+    assert not it.take(0, m) and it.missing == 0 and m.steps == 0
+    it.receive(transitions(sequence=1, first_step=5, observations=follow(transitions())))
+    assert it.take(0, m) and it.missing is None and m.steps == 10
+
+
+def test_what_arrives_twice_is_counted_and_taken_once():
+    it, m = known(), memory()
+    it.receive(transitions())
+    it.receive(transitions())
+    it.receive(commit())
+    assert it.take(0, m) and m.steps == 5
+    it.receive(transitions())
+    assert it.duplicated == {'transitions': 2}
+
+
+def test_a_score_for_no_segment_is_left_out_counted_and_said(caplog):
+    it, m = known(), memory()
+    it.receive(transitions())
+    it.receive(score(first_step=7))
+    it.receive(commit(scores=last(0)))
+    assert it.take(0, m)
+    assert it.refused == {'composite_rewards': 1} and len(m.segment_ids()) == 0
+    assert 'there is no such segment' in caplog.text
+
+
+def test_records_of_several_sources_enter_in_the_order_of_their_names():
+    settings = tiny(simulators=2)
+    it = Intake(run(settings), settings, scores=False)
+    for source in ('b', 'a'):
+        it.receive(task_spec(source=source))
+        it.receive(transitions(source=source))
+    m = memory()
+    zero = np.zeros(2, np.int64)
+    it.receive(replace(commit(), sources=('b', 'a'), transitions=zero))
+    assert it.take(0, m) and list(m.labels()) == ['a', 'b']

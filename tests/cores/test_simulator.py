@@ -1,0 +1,550 @@
+"""The simulator's records against what they must add up to, and the policies that it refuses."""
+
+import dataclasses
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+from codetr_ros import records
+from codetr_ros.config import Settings, SettingsError
+from codetr_ros.cores.simulator import Simulator, ThreadChoice
+from codetr_ros.policy.acting import ActingPolicy
+from codetr_ros.policy.actor import Actor, describe, weights_bytes
+from codetr_ros.records import (
+    CompositeReward,
+    EpisodeResult,
+    Metrics,
+    Policy,
+    RecordError,
+    TaskSpec,
+    Transitions,
+    TrueRewards,
+)
+from codetr_ros.seeding import generator, seed_torch
+from codetr_ros.simulation import tasks
+from codetr_ros.simulation.source import CHUNK_BYTES, CHUNK_STEPS, chunk_steps
+from helpers.builders import policy, same, task_spec, tiny
+from helpers.builders import run as run_spec
+
+FALLS = 'InvertedPendulum-v5'  # within some ten steps under the random policy
+NEVER_ENDS = 'Pendulum-v1'  # 200 steps
+
+
+def permit(phase, steps=200, sources=('sim',), **changes):
+    steps = np.full(len(sources), steps, np.uint32)
+    return policy(phase=phase, version=phase - 1, sources=sources, steps=steps, **changes)
+
+
+def learnt(task, seed=0):
+    """What a learner says of a fresh policy for the task: fields of a Policy."""
+    environment = tasks.find(task)
+    sizes = {FALLS: (4, 1), NEVER_ENDS: (3, 1)}[environment.name]
+    seed_torch(seed)
+    actor = Actor(*sizes, (16, 16))
+    weights = weights_bytes(actor)
+    return {'random': False, 'network': describe(*sizes, (16, 16)), 'weights': weights}
+
+
+def slices(settings: Settings, policies, source='sim', threads=None):
+    """What a simulator yields, slice by slice, when it has the policies from the start."""
+    simulator = Simulator(run_spec(settings), settings, source, threads)
+    for each in policies:
+        simulator.receive(each)
+    out = []
+    for records_of_slice in simulator.work():
+        if records_of_slice is None:
+            break
+        out.append(records_of_slice)
+    simulator.close()
+    return out
+
+
+def simulate(*arguments, **named):
+    return [record for each in slices(*arguments, **named) for record in each]
+
+
+def kind(kind, said):
+    return [record for record in said if type(record) is kind]
+
+
+def true_rewards(said):
+    """The environment's rewards, episode by episode."""
+    episodes = {}
+    for record in kind(TrueRewards, said):
+        assert record.first_step == len(episodes.setdefault(record.episode, []))
+        episodes[record.episode].extend(record.rewards.astype(np.float64))
+    return {number: np.array(rewards) for number, rewards in episodes.items()}
+
+
+@pytest.fixture(scope='module')
+def falling():
+    """Six phases, the first two random, of a task that ends early; 7 steps a segment."""
+    settings = tiny(task=FALLS)
+    later = [permit(k, **learnt(FALLS)) for k in range(2, 6)]
+    return settings, simulate(settings, [permit(0), permit(1), *later])
+
+
+@pytest.fixture(scope='module')
+def lasting():
+    """Six phases of a task that does not end early; 7 divides neither phase nor episode."""
+    settings = tiny(task=NEVER_ENDS)
+    return settings, simulate(settings, [permit(k, steps=130) for k in range(6)])
+
+
+both = pytest.mark.parametrize('which', ['falling', 'lasting'])
+
+
+def test_the_first_slice_says_what_is_simulated():
+    said = slices(tiny(task=NEVER_ENDS, r_max=2.5), [])
+    assert len(said) == 1
+    expected = task_spec(
+        source='sim', task=NEVER_ENDS, observation_size=3, action_size=1, horizon=200, r_max=2.5
+    )
+    assert same(said[0][0], expected)
+
+
+@both
+def test_chunks_concatenate_to_whole_episodes(which, request):
+    _, said = request.getfixturevalue(which)
+    chunks = kind(Transitions, said)
+    assert [chunk.sequence for chunk in chunks] == list(range(len(chunks)))
+    last = None
+    for chunk in chunks:
+        assert chunk.steps == len(chunk.actions) == len(chunk.observations) - 1 > 0
+        assert np.abs(chunk.actions).max() <= 1
+        if last is None or last.terminated or last.truncated:
+            assert chunk.first_step == 0
+            assert chunk.episode == (0 if last is None else last.episode + 1)
+        else:
+            assert (chunk.episode, chunk.first_step) == (
+                last.episode,
+                last.first_step + last.steps,
+            )
+            assert (chunk.observations[0] == last.observations[-1]).all()
+        last = chunk
+
+
+@pytest.mark.parametrize(('which', 'task'), [('falling', FALLS), ('lasting', NEVER_ENDS)])
+def test_the_environment_repeats_the_episodes_from_seeds_and_actions(which, task, request):
+    settings, said = request.getfixturevalue(which)
+    environment = tasks.make(task)
+    rewards = true_rewards(said)
+    ended = None
+    for chunk in kind(Transitions, said):
+        if chunk.first_step == 0:
+            seeds = generator(settings.seed, 'reset', 'sim', chunk.episode)
+            observation = environment.reset(int(seeds.integers(2**31)))
+        assert (observation == chunk.observations[0]).all()
+        for t, action in enumerate(chunk.actions):
+            observation, reward, ended = environment.step(action)
+            assert (observation == chunk.observations[t + 1]).all()
+            assert rewards[chunk.episode][chunk.first_step + t] == np.float32(reward)
+        assert chunk.terminated == ended
+        length = chunk.first_step + chunk.steps
+        assert chunk.truncated == (length == environment.horizon and not ended)
+
+
+def test_the_two_tasks_end_their_episodes_in_different_ways(falling, lasting):
+    assert any(chunk.terminated for chunk in kind(Transitions, falling[1]))
+    assert any(chunk.truncated for chunk in kind(Transitions, lasting[1]))
+    assert not any(chunk.terminated for chunk in kind(Transitions, lasting[1]))
+
+
+@both
+@pytest.mark.parametrize('composite', ['sum', 'square_sum', 'max_hard'])
+def test_composites_are_those_of_the_true_rewards_cut_every_seven_steps(which, composite, request):
+    formula = {
+        'sum': np.sum,
+        'square_sum': lambda r: np.sum(r) * abs(np.sum(r)),
+        'max_hard': np.max,
+    }[composite]
+    settings, said = request.getfixturevalue(which)
+    if composite != settings.composite:
+        changed = settings.changed({'composite': composite})
+        said = simulate(changed, [permit(k, steps=130) for k in range(3)])
+    ended = {c.episode for c in kind(Transitions, said) if c.terminated or c.truncated}
+    expected = []
+    for episode, rewards in true_rewards(said).items():
+        for first in range(0, len(rewards), 7):
+            segment = rewards[first : first + 7]
+            if len(segment) == 7 or episode in ended:
+                expected.append((episode, first, len(segment), formula(segment)))
+    scores = kind(CompositeReward, said)
+    assert [(s.episode, s.first_step, s.length) for s in scores] == [e[:3] for e in expected]
+    np.testing.assert_allclose([s.value for s in scores], [e[3] for e in expected], rtol=1e-6)
+    assert [score.sequence for score in scores] == list(range(len(scores)))
+    assert {(score.source, score.scorer) for score in scores} == {('sim', 'sim')}
+
+
+def test_a_segment_cut_short_by_termination_still_gets_its_score(falling):
+    _, said = falling
+    lengths = {c.episode: c.first_step + c.steps for c in kind(Transitions, said) if c.terminated}
+    short = {e: n % 7 for e, n in lengths.items() if n % 7}
+    assert len(short) > 3
+    scored = {s.episode: s.length for s in kind(CompositeReward, said) if s.length < 7}
+    assert scored == short
+
+
+def test_a_terminal_state_reached_at_the_horizon_is_terminated_not_truncated():
+    pendulum = gymnasium.spec(FALLS).entry_point
+    falls = tiny(task=FALLS, delay=3)
+    first = kind(EpisodeResult, simulate(falls, [permit(0)]))[0]
+    assert first.terminated
+    gymnasium.register('Short-v0', pendulum, max_episode_steps=first.length)
+    try:
+        said = simulate(falls.changed({'task': 'Short-v0'}), [permit(0)])
+    finally:
+        del gymnasium.registry['Short-v0']
+    ends = [c for c in kind(Transitions, said) if c.first_step + c.steps == first.length]
+    assert (ends[0].terminated, ends[0].truncated) == (True, False)
+    for chunk in kind(Transitions, said):
+        assert not (chunk.terminated and chunk.truncated)
+
+
+@both
+def test_what_belongs_to_a_chunk_follows_it_in_the_same_slice(which, request):
+    settings, _ = request.getfixturevalue(which)
+    for said in slices(settings, [permit(k) for k in range(2)])[1:]:
+        chunk, true, *rest = said
+        assert isinstance(chunk, Transitions)
+        assert isinstance(true, TrueRewards)
+        for name in ('sequence', 'phase', 'episode', 'first_step'):
+            assert getattr(chunk, name) == getattr(true, name)
+        assert len(true.rewards) == chunk.steps
+        kinds = [type(record) for record in rest]
+        order = [CompositeReward, EpisodeResult, Metrics]
+        assert kinds == sorted(kinds, key=order.index)
+        span = range(chunk.first_step + 1, chunk.first_step + chunk.steps + 1)
+        for score in kind(CompositeReward, rest):
+            assert score.episode == chunk.episode
+            assert score.first_step + score.length in span
+        assert len(kind(EpisodeResult, rest)) == (chunk.terminated or chunk.truncated)
+        assert len(kind(Metrics, rest)) == chunk.phase_end
+
+
+@both
+def test_each_phase_has_exactly_its_steps_and_names_the_scores_due(which, request):
+    _, said = request.getfixturevalue(which)
+    steps, scores, phase = 0, 0, 0
+    due = None
+    for record in said:
+        if isinstance(record, Transitions):
+            if due is not None:
+                assert (steps, scores, due) == (130 if which == 'lasting' else 200, due, due)
+                steps, scores, phase, due = 0, 0, phase + 1, None
+            assert record.phase == phase
+            steps += record.steps
+            if record.phase_end:
+                due = record.scores_due
+            else:
+                assert record.scores_due == 0
+        elif isinstance(record, CompositeReward):
+            scores += 1
+    assert (phase, scores) == (5, due)
+
+
+@both
+def test_episode_results_are_those_of_the_true_rewards(which, request):
+    settings, said = request.getfixturevalue(which)
+    rewards, r_max = true_rewards(said), 1.0
+    horizon = 200 if which == 'lasting' else 1000
+    step = 0
+    for record in said:
+        if isinstance(record, Transitions):
+            step += record.steps
+            chunk = record
+        if isinstance(record, EpisodeResult):
+            assert (record.source, record.purpose) == ('sim', 'training')
+            phase_steps = 130 if which == 'lasting' else 200
+            assert record.step == step + chunk.phase * (settings.phase_steps - phase_steps)
+            assert record.version == chunk.phase - 1
+            assert record.episode == chunk.episode
+            assert record.length == len(rewards[record.episode])
+            assert record.terminated == chunk.terminated
+            assert record.true_return == pytest.approx(rewards[record.episode].sum(), rel=1e-5)
+            assert record.composite_return == pytest.approx(record.true_return)  # a sum of sums
+            assert record.score == pytest.approx(record.true_return / (horizon * r_max))
+
+
+def test_the_wall_time_of_each_phase_is_said_once(falling):
+    _, said = falling
+    metrics = kind(Metrics, said)
+    assert [m.phase for m in metrics] == [0, 1, 2, 3, 4, 5]
+    assert [m.step for m in metrics] == [200, 400, 600, 800, 1000, 1200]
+    assert {(m.role, m.node, m.names) for m in metrics} == {('sim', 'sim', ('simulate_seconds',))}
+    assert all(0 < m.values[0] < 60 for m in metrics)
+
+
+def test_a_learnt_policy_acts_with_the_noise_of_its_phase(falling):
+    settings, said = falling
+    acting = ActingPolicy.from_record(permit(2, **learnt(FALLS)), 4, 1)
+    chunks = [chunk for chunk in kind(Transitions, said) if chunk.phase == 2]
+    observations = np.concatenate([chunk.observations[:-1] for chunk in chunks])
+    actions = np.concatenate([chunk.actions for chunk in chunks])
+    noise = generator(settings.seed, 'noise', 'sim', 2).standard_normal((200, 1), dtype=np.float32)
+    expected = [acting.act(o, e) for o, e in zip(observations, noise, strict=True)]
+    assert actions.tobytes() == np.array(expected).tobytes()
+    assert actions.std() > 0.1
+
+
+def test_random_actions_are_uniform(lasting):
+    actions = np.concatenate([chunk.actions for chunk in kind(Transitions, lasting[1])])
+    assert -1 <= actions.min() < -0.95
+    assert 0.95 < actions.max() <= 1
+    assert abs(actions.mean()) < 0.1
+    assert abs(actions.std() - np.sqrt(1 / 3)) < 0.03
+
+
+def deterministic(said):
+    """All but the wall time, which differs from run to run."""
+    return [record for record in said if not isinstance(record, Metrics)]
+
+
+def test_the_same_seed_gives_the_same_bits(falling):
+    settings, said = falling
+    later = [permit(k, **learnt(FALLS)) for k in range(2, 6)]
+    again = simulate(settings, [permit(0), permit(1), *later])
+    assert len(again) == len(said)
+    for a, b in zip(deterministic(again), deterministic(said), strict=True):
+        assert same(a, b)
+
+
+def test_another_source_and_another_seed_give_other_episodes():
+    settings = tiny(task=NEVER_ENDS)
+    names = ('sim', 'sim_2')
+    one = kind(Transitions, simulate(settings, [permit(0, sources=names)], source='sim'))
+    two = kind(Transitions, simulate(settings, [permit(0, sources=names)], source='sim_2'))
+    other = settings.changed({'seed': 1})
+    three = kind(Transitions, simulate(other, [permit(0, sources=names)], source='sim'))
+    for a, b in ((one, two), (one, three), (two, three)):
+        assert (a[0].observations[0] != b[0].observations[0]).any()
+        assert (a[0].actions != b[0].actions).any()
+
+
+def test_policies_that_arrive_early_wait_for_their_turn(falling):
+    settings, said = falling
+    later = [permit(k, **learnt(FALLS)) for k in range(2, 6)]
+    shuffled = simulate(settings, [later[2], permit(1), later[3], later[0], permit(0), later[1]])
+    for a, b in zip(deterministic(shuffled), deterministic(said), strict=True):
+        assert same(a, b)
+
+
+def test_nothing_is_done_without_a_permission_and_work_goes_on_when_one_comes():
+    settings = tiny(task=NEVER_ENDS)
+    simulator = Simulator(run_spec(settings), settings, 'sim')
+    work = simulator.work()
+    next(work)
+    simulator.receive(permit(1))
+    assert [next(work), next(work)] == [None, None]
+    simulator.receive(permit(0))
+    assert next(work)[0].phase == 0
+
+
+def test_a_simulator_has_finished_after_a_policy_without_steps():
+    settings = tiny(task=NEVER_ENDS)
+    simulator = Simulator(run_spec(settings), settings, 'sim')
+    simulator.receive(permit(1, steps=0, **learnt(NEVER_ENDS)))
+    simulator.receive(permit(0))
+    work = simulator.work()
+    while next(work) is not None:
+        assert not simulator.finished
+    assert simulator.finished
+    assert next(work) is None
+    simulator.receive(permit(2, steps=0))  # with overlap a second one follows
+    simulator.close()
+    simulator.close()
+    counters = simulator.report()['counters']
+    assert counters == {'chunks': 1, 'steps': 200, 'scores': 29, 'episodes': 1, 'phases': 1}
+
+
+def test_a_phase_in_which_only_others_have_steps_is_passed_over():
+    settings = tiny(task=NEVER_ENDS, simulators=2)
+    shares = np.array([1, 0], np.uint32)
+    first = policy(sources=('sim', 'sim_2'), steps=shares)
+    second = permit(1, steps=10, sources=('sim', 'sim_2'))
+    said = simulate(settings, [first, second], source='sim_2')
+    assert [chunk.phase for chunk in kind(Transitions, said)] == [1]
+
+
+def several(task, envs, threads=None, phases=4):
+    """Slices of a simulator with some environments: two random phases, then two learnt ones."""
+    settings = tiny(task=task, envs=envs, phase_steps=101 * envs)
+    names = settings.sources_of('sim')
+    policies = [permit(k, 101, names, **(learnt(task) if k > 1 else {})) for k in range(phases)]
+    return settings, slices(settings, policies, threads=threads)
+
+
+@pytest.mark.parametrize('task', [FALLS, NEVER_ENDS])
+def test_threads_change_no_bit_and_no_order(task):
+    _, alone = several(task, 3, threads=1)
+    _, together = several(task, 3, threads=3)
+    assert len(alone) == len(together)
+    for a, b in zip(alone, together, strict=True):
+        assert all(map(same, deterministic(a), deterministic(b)))
+        assert len(a) == len(b)
+
+
+def test_threads_are_used_where_they_are_faster_and_tried_again_now_and_then():
+    choice, cost, used = ThreadChoice(), {True: 3.0, False: 1.0}, []
+    for number in range(400):
+        if number == 200:  # from now on another policy acts, say
+            cost = {True: 1.0, False: 2.0}
+        used.append(choice.threads())
+        choice.note(used[-1], cost[used[-1]])
+    before, after = used[:200], used[200 + ThreadChoice.TRY_AGAIN :]
+    assert {True, False} == set(used[:2])
+    assert 0 < before.count(True) <= 200 / ThreadChoice.TRY_AGAIN + 2
+    assert 0 < after.count(False) <= len(after) / ThreadChoice.TRY_AGAIN + 2
+
+
+@pytest.mark.parametrize('task', [FALLS, NEVER_ENDS])
+def test_each_environment_is_the_source_that_a_simulator_of_its_name_would_be(task):
+    settings, said = several(task, 3, threads=2)
+    names = settings.sources_of('sim')
+    assert names == ('sim-1', 'sim-2', 'sim-3')
+    own = settings.changed({'envs': 1, 'simulators': 3})
+    policies = [permit(k, 101, names, **(learnt(task) if k > 1 else {})) for k in range(4)]
+    for name in names:
+        expected = deterministic(simulate(own, policies, source=name))
+        records_of_it = [r for one in said for r in deterministic(one) if r.source == name]
+        assert len(records_of_it) == len(expected) > 10
+        assert all(map(same, records_of_it, expected))
+
+
+def test_environments_take_turns_in_the_order_of_their_names():
+    _, said = several(NEVER_ENDS, 3)
+    assert [spec.source for spec in said[0]] == ['sim-1', 'sim-2', 'sim-3']
+    for one in said[1:]:
+        chunks = [chunk.source for chunk in kind(Transitions, one)]
+        assert chunks == ['sim-1', 'sim-2', 'sim-3']
+    ends = [kind(Metrics, one) for one in said if kind(Metrics, one)]
+    assert [m.node for (m,) in ends] == ['sim'] * 4  # one for each phase, of all environments
+
+
+def test_an_environment_without_steps_in_a_phase_is_passed_over():
+    settings = tiny(task=NEVER_ENDS, envs=3)
+    names = settings.sources_of('sim')
+    some = policy(sources=names, steps=np.array([1, 0, 2], np.uint32))
+    said = simulate(settings, [some, permit(1, 1, names)])
+    chunks = [(c.phase, c.source, c.sequence, c.steps) for c in kind(Transitions, said)]
+    assert chunks == [
+        *((0, 'sim-1', 0, 1), (0, 'sim-3', 0, 2)),
+        *((1, 'sim-1', 1, 1), (1, 'sim-2', 0, 1), (1, 'sim-3', 1, 1)),
+    ]
+    assert [m.phase for m in kind(Metrics, said)] == [0, 1]
+
+
+def test_a_policy_that_leaves_out_an_environment_is_refused():
+    settings = tiny(task=NEVER_ENDS, envs=2)
+    simulator = Simulator(run_spec(settings), settings, 'sim_2')
+    names = ('sim-1', 'sim-2', 'sim_2-1', 'robot')
+    with pytest.raises(RecordError, match=r"not 'sim_2-2': start the run with simulators=3"):
+        simulator.receive(permit(0, sources=names))
+    simulator.close()
+
+
+def test_counts_are_those_of_all_environments():
+    settings = tiny(task=NEVER_ENDS, envs=2)
+    simulator = Simulator(run_spec(settings), settings, 'sim')
+    names = settings.sources_of('sim')
+    simulator.receive(permit(0, 200, names))
+    for said in simulator.work():
+        if said is None:
+            break
+    simulator.close()
+    counters = simulator.report()['counters']
+    assert counters == {'chunks': 2, 'steps': 400, 'scores': 58, 'episodes': 2, 'phases': 1}
+
+
+def test_a_chunk_fits_into_a_message():
+    for observation_size, action_size in ((3, 1), (348, 17), (6000, 60), (24_000, 1), (24_999, 1)):
+        steps = chunk_steps(observation_size, action_size)
+        assert 1 <= steps <= CHUNK_STEPS
+
+        def size(steps, o=observation_size, a=action_size):
+            return 4 * ((steps + 1) * o + steps * a)
+
+        assert size(steps) <= CHUNK_BYTES
+        assert steps == CHUNK_STEPS or size(steps + 1) > CHUNK_BYTES
+    assert chunk_steps(25_000, 1) == 0
+
+
+def test_chunks_of_many_observations_are_shorter_and_still_whole():
+    settings = tiny(task='Humanoid-v5', phase_steps=400)
+    chunks = kind(Transitions, simulate(settings, [permit(0, steps=400)]))
+    assert sum(chunk.steps for chunk in chunks) == 400
+    for chunk in chunks:
+        assert chunk.observations.nbytes + chunk.actions.nbytes <= CHUNK_BYTES
+
+
+def test_a_delay_beyond_the_horizon_is_refused_before_anything_is_simulated():
+    settings = tiny(task=NEVER_ENDS, delay=201)
+    with pytest.raises(
+        SettingsError, match=r"delay = 201: task 'Pendulum-v1' has a horizon of 200"
+    ):
+        Simulator(run_spec(settings), settings, 'sim')
+
+
+def test_a_delay_as_long_as_the_episode_gives_one_score_at_its_end():
+    settings = tiny(task=NEVER_ENDS, delay=200)
+    said = simulate(settings, [permit(k) for k in range(3)])
+    scores = [(score.episode, score.length) for score in kind(CompositeReward, said)]
+    assert scores == [(0, 200), (1, 200), (2, 200)]
+
+
+def changed(record: Policy, **fields):
+    return dataclasses.replace(record, **fields)
+
+
+@pytest.mark.parametrize(
+    ('wrong', 'message'),
+    [
+        (permit(1, run_id='other'), "run 'other', this is run 'run'"),
+        (permit(0), 'has run phase=0 already'),
+        (permit(2), 'has received phase=2 already'),
+        (permit(-1), 'phase=-1.*this run has phase 0 to 6'),
+        (permit(8), 'phase=8.*this run has phase 0 to 6'),
+        (permit(1, sources=('robot',)), r"sources=\['robot'\], not 'sim'"),
+        (changed(permit(1), sources=('sim', 'b')), 'steps has 1 entries for 2 sources'),
+        (permit(1, **learnt(FALLS)), "cannot act in task 'Pendulum-v1'.*another architecture"),
+        (permit(1, **learnt(NEVER_ENDS) | {'weights': b'junk'}), 'are not safetensors'),
+        (task_spec(), 'takes policies only, not TaskSpec'),
+    ],
+)
+def test_a_policy_that_must_not_be_followed_is_refused_and_changes_nothing(wrong, message):
+    settings = tiny(task=NEVER_ENDS)
+    simulator = Simulator(run_spec(settings), settings, 'sim')
+    for each in (permit(0), permit(2)):
+        simulator.receive(each)
+    work = simulator.work()
+    said = [next(work), next(work)]  # phase 0 is one chunk
+    assert next(work) is None
+    with pytest.raises(RecordError, match=message):
+        simulator.receive(wrong)
+    simulator.receive(permit(1))
+    said += [next(work), next(work)]
+    expected = slices(settings, [permit(0), permit(1), permit(2)])
+    for ours, theirs in zip(said, expected, strict=True):
+        for a, b in zip(deterministic(ours), deterministic(theirs), strict=True):
+            assert same(a, b)
+
+
+def test_weights_that_are_not_finite_are_refused():
+    settings = tiny(task=NEVER_ENDS)
+    actor = Actor(3, 1, (16, 16))
+    with torch.no_grad():
+        actor.heads.bias[0] = float('nan')
+    weights = weights_bytes(actor)
+    simulator = Simulator(run_spec(settings), settings, 'sim')
+    with pytest.raises(RecordError, match="'heads.bias' are not finite"):
+        simulator.receive(permit(0, **learnt(NEVER_ENDS) | {'weights': weights}))
+
+
+def test_only_records_that_a_simulator_publishes_come_out(falling):
+    _, said = falling
+    allowed = {TaskSpec, Transitions, TrueRewards, CompositeReward, EpisodeResult, Metrics}
+    assert {type(record) for record in said} == allowed
+    assert {record.run_id for record in said} == {'run'}
+    assert all(type(record) in records.TOPICS for record in said)

@@ -1,0 +1,213 @@
+"""What must not be taken in is refused by the nodes that get it, said and counted, and the run
+ends as if it had never come.
+"""
+
+import re
+import signal
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS')
+
+from codetr_ros.config import Settings
+from codetr_ros.policy.actor import Actor, describe, weights_bytes
+from codetr_ros.records import CompositeReward, Policy, Record
+from helpers.builders import policy, score, tiny, transitions
+from helpers.nodes import Nodes, Witness, domain
+from helpers.runs import finish, start, write
+
+OBSERVATION, ACTION = 9, 1  # of InvertedDoublePendulum-v5
+LATER = 1_000_000  # a sequence number that the run never reaches
+
+
+def chunk(**changes) -> Record:
+    """Five steps as this task has them, with numbers that are not due."""
+    fit = {
+        'observations': np.zeros((6, OBSERVATION), np.float32),
+        'actions': np.zeros((5, ACTION), np.float32),
+    }
+    return transitions(**({'sequence': LATER} | fit | changes))
+
+
+def of_another_architecture(settings: Settings) -> Policy:
+    """The last phase's policy, for a task with one number more."""
+    hidden = settings.sac.hidden
+    return policy(
+        phase=settings.phases - 1,
+        version=settings.phases - 1,
+        random=False,
+        network=describe(OBSERVATION + 1, ACTION, hidden),
+        weights=weights_bytes(Actor(OBSERVATION + 1, ACTION, hidden)),
+    )
+
+
+def bad_transitions() -> list[Record]:
+    nan = np.zeros((6, OBSERVATION), np.float32)
+    nan[2, 1] = np.nan
+    return [
+        chunk(observations=nan),
+        chunk(run_id='another'),
+        chunk(observations=np.zeros((6, OBSERVATION - 1), np.float32)),
+        chunk(observations=np.zeros((7, OBSERVATION), np.float32)),
+        chunk(),  # sound, but nothing between the last and this one ever came
+        chunk(sequence=0),  # has come before
+    ]
+
+
+def bad_scores(known: CompositeReward) -> list[Record]:
+    """Scores of a visitor, and of the simulator.
+
+    Args:
+        known: one that 'sim' has given.
+    """
+    visitor = {'scorer': 'visitor', 'value': 7.5}
+    return [
+        score(**visitor, sequence=0, episode=LATER),
+        score(**visitor, sequence=1, first_step=3),
+        replace(known, **visitor, sequence=2),  # of a segment that 'sim' has scored
+        known,  # the very message of before
+        score(value=np.nan),
+    ]
+
+
+@dataclass
+class Outcome:
+    """What a run with an intruder left, and the digests of one without."""
+
+    nodes: Nodes
+    codes: dict[str, int | None]
+    expected: dict[str, str]
+
+    def refusals(self, node: str, topic: str) -> list[str]:
+        """Why a node says that it refused messages of a topic."""
+        return re.findall(rf"refused on '{topic}' \(number \d+\): (.*)", self.nodes.log(node))
+
+
+@pytest.fixture(scope='module')
+def outcome(tmp_path_factory):
+    """A run that is held in the middle until everybody has got what an intruder sends."""
+    folder = tmp_path_factory.mktemp('intruded')
+    settings = tiny()
+    alone = start(write(settings, folder / 'alone'), folder / 'alone', '--in-process')
+    with domain(), Nodes(settings, folder / 'run') as nodes, Witness(nodes) as witness:
+        for name in nodes.names:
+            nodes.start(name)
+        witness.until(lambda: witness.committed(1) and witness.scores)
+        nodes.send(signal.SIGSTOP, 'sim')  # it waits for the next policy: no step, no phase
+        witness.say(*bad_transitions())
+        witness.say(*bad_scores(witness.scores[0]))
+        witness.say(policy(), of_another_architecture(settings))
+
+        def refused(node, topic):
+            return int(witness.counters.get(node, {}).get(f'refused {topic}', 0))
+
+        witness.until(
+            lambda: (
+                refused('record', 'transitions') == 5
+                and refused('reward', 'transitions') == 5
+                and refused('learner', 'transitions') == 5
+                and refused('record', 'composite_rewards') == 1
+                and refused('reward', 'composite_rewards') == 1
+                and refused('evaluate', 'policy') == 1
+            )
+        )
+        nodes.send(signal.SIGCONT, 'sim')
+        codes = nodes.wait()
+        expected, _ = finish(alone, folder / 'alone')
+        yield Outcome(nodes, codes, expected)
+
+
+def test_the_run_ends_as_if_nobody_had_intruded(outcome):
+    assert set(outcome.codes.values()) == {0}, outcome.codes
+    learner, reward = outcome.nodes.report('learner'), outcome.nodes.report('reward')
+    assert learner['policy_sha256'] == outcome.expected['policy_sha256']
+    assert reward['reward_model_sha256'] == outcome.expected['reward_model_sha256']
+    for name in outcome.nodes.names:
+        assert outcome.nodes.report(name)['finished']
+        assert 'Traceback' not in outcome.nodes.log(name)
+
+
+@pytest.mark.parametrize('node', ['record', 'reward', 'learner'])
+@pytest.mark.parametrize(
+    'why',
+    [
+        'Transitions(source=sim, sequence=1000000, phase=0, episode=0, first_step=0, steps=5, '
+        'terminated=False, truncated=False, phase_end=False, scores_due=0): '
+        "observations[2, 1] is nan: all values must be finite; mend what 'sim' publishes",
+        "is of run 'another', this is run 'run': stop the other run, or give each run a "
+        'namespace of its own',
+        'observations have shape (6, 8), (6, 9) expected of task InvertedDoublePendulum-v5 as '
+        "'sim' announced it",
+        "Transitions(sequence=1000000, phase=0) from 'sim': observations has length 63, expected "
+        "a multiple of 6 for steps=5; mend what 'sim' publishes on 'transitions'",
+    ],
+    ids=['NaN', 'another run', 'another size', 'a length that disagrees'],
+)
+def test_wrong_transitions_are_refused_by_all_that_read_them(outcome, node, why):
+    assert sum(why in said for said in outcome.refusals(node, 'transitions')) == 1
+
+
+def test_transitions_out_of_sequence_are_refused_by_all_that_read_them(outcome):
+    assert re.search(
+        r"sequence=1000000.* is out of sequence: \d+ is the next of 'sim'. What lies between "
+        r"never arrived: restart 'sim'",
+        outcome.refusals('record', 'transitions')[-1],
+    )
+    for node in ('reward', 'learner'):
+        assert re.search(
+            r'sequence=1000000.* is out of sequence: the permitted phases hold fewer than 400 '
+            r"records, and \d+ is the next of 'sim' to be taken in",
+            outcome.refusals(node, 'transitions')[-1],
+        )
+
+
+def test_what_arrives_again_is_counted_as_duplicated_and_dropped(outcome):
+    for node in ('record', 'reward', 'learner'):
+        said = outcome.nodes.report(node)['duplicated']
+        assert said['transitions'] == 1, node
+        assert said.get('composite_rewards', 0) == (node != 'learner'), node
+
+
+@pytest.mark.parametrize(
+    'why',
+    [
+        'episode 1000000, first_step 0, length 7: no such episode is here',
+        'episode 0, first_step 3, length 7: there is no such segment. Segments have 7 steps, '
+        'start at multiples of 7',
+        'the segment has its composite reward already; the first one is kept',
+        'value is nan: a composite reward must be finite',
+    ],
+    ids=['no such episode', 'no such segment', 'scored already', 'NaN'],
+)
+def test_scores_that_fit_no_segment_are_refused_by_the_reward_node(outcome, why):
+    said = [line for line in outcome.nodes.log('reward').splitlines() if why in line]
+    assert len(said) == 1
+    assert 'nan' in why or "composite reward 7.5 of 'visitor' for 'sim'" in said[0]
+
+
+@pytest.mark.parametrize('node', ['sim', 'evaluate'])
+def test_a_policy_of_another_architecture_is_refused_naming_both(outcome, node):
+    said = next(s for s in outcome.refusals(node, 'policy') if 'architecture' in s)
+    settings = tiny()
+    assert 'Policy(phase=5, version=5' in said
+    assert f'needs {describe(OBSERVATION, ACTION, settings.sac.hidden)}' in said
+    assert f'the policy is {describe(OBSERVATION + 1, ACTION, settings.sac.hidden)}' in said
+
+
+def test_a_phase_that_is_permitted_twice_is_refused_by_the_simulator(outcome):
+    assert any(
+        "'sim' has run phase=0 already" in said for said in outcome.refusals('sim', 'policy')
+    )
+
+
+def test_every_refusal_is_counted_in_the_report_of_the_node(outcome):
+    refused = {name: outcome.nodes.report(name)['refused'] for name in outcome.nodes.names}
+    assert refused == {
+        'sim': {'policy': 2},
+        'evaluate': {'policy': 1},
+        'reward': {'transitions': 5, 'composite_rewards': 4},
+        'learner': {'transitions': 5},
+        'record': {'transitions': 5, 'composite_rewards': 1, 'policy': 1},
+    }

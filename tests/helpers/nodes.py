@@ -1,0 +1,208 @@
+"""The nodes of a run, started one by one as `ros2 run` starts them, and a witness in their
+namespace that hears everything and can say anything.
+"""
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from domain_coordinator import domain_id
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.signals import SignalHandlerOptions
+
+from codetr_ros.config import Settings
+from codetr_ros.processes import launcher
+from codetr_ros.records import TOPICS, Commit, CompositeReward, Presence, Record
+from codetr_ros.ros import messages, qos
+from codetr_ros.ros.link import Link
+from codetr_ros.runs import folder as run_folder
+
+PATIENCE = 120.0  # [s] a busy machine starts five nodes in 40
+RUN_ID = 'run'
+NAMESPACE = f'/run_{RUN_ID}'
+
+
+@contextmanager
+def domain() -> Iterator[None]:
+    """A ROS domain for processes that several tests share."""
+    before = os.environ.get('ROS_DOMAIN_ID')
+    with domain_id() as number:
+        os.environ['ROS_DOMAIN_ID'] = str(number)
+        try:
+            yield
+        finally:
+            del os.environ['ROS_DOMAIN_ID']
+            if before is not None:
+                os.environ['ROS_DOMAIN_ID'] = before
+
+
+class Nodes:
+    """The processes of a run. A context manager: on leaving it, none is left.
+
+    Args:
+        settings: of the run.
+        folder: of the run.
+    """
+
+    def __init__(self, settings: Settings, folder: Path) -> None:
+        self.settings = settings
+        self.folder = run_folder.create(folder)
+        run_folder.write_settings(folder, settings)
+        self._commands = {c.name: c for c in launcher.commands(settings, RUN_ID, folder)}
+        self._environment = launcher.environment(settings)
+        self._processes = launcher.Processes(print)
+        self.names = tuple(self._commands)
+
+    def start(self, name: str, *parameters: str) -> None:
+        """Start a node, with parameters such as `delay:=9` beside those of `codetr train`."""
+        made = self._commands[name]
+        more = [word for parameter in parameters for word in ('-p', parameter)]
+        command = launcher.Command(name, made.role, (*made.arguments, *more))
+        self._processes.start([command], self.folder / run_folder.LOGS, self._environment)
+
+    def send(self, number: signal.Signals, *names: str) -> None:
+        """Send a signal to nodes; to all of them if none is named."""
+        for node in self._processes.running():
+            if not names or node.name in names:
+                os.kill(node.process.pid, number)
+
+    def codes(self) -> dict[str, int | None]:
+        """Exit codes by name, None for those that run."""
+        return {node.name: node.code for node in self._processes.nodes}
+
+    def wait(self, *names: str) -> dict[str, int | None]:
+        """Wait until nodes have ended, all of them if none is named; their exit codes."""
+        end = time.monotonic() + PATIENCE
+        for node in self._processes.nodes:
+            if not names or node.name in names:
+                node.process.wait(max(0.1, end - time.monotonic()))
+        return self.codes()
+
+    def log(self, name: str) -> str:
+        """What a node has said."""
+        return (self.folder / run_folder.LOGS / f'{name}.log').read_text()
+
+    def report(self, name: str) -> dict[str, Any]:
+        """The report that a node has left."""
+        role = self._commands[name].role
+        return run_folder.read_report(run_folder.report_path(self.folder, role, name))
+
+    def __enter__(self) -> 'Nodes':
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._processes.kill(self._processes.running())
+
+
+class Witness:
+    """A node in the namespace of the run that is no part of it.
+
+    Args:
+        nodes: whose death ends the waiting.
+    """
+
+    def __init__(self, nodes: Nodes) -> None:
+        self._nodes = nodes
+        self.presence: dict[str, Presence] = {}
+        self.commits: list[Commit] = []
+        self.scores: list[CompositeReward] = []
+        self.counters: dict[str, dict[str, str]] = {}
+
+    def __enter__(self) -> 'Witness':
+        rclpy.init(
+            args=['witness', '--ros-args', '-r', f'__ns:={NAMESPACE}'],
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        self.link = Link('witness')
+        self.link.subscribe(Presence, self._hear)
+        self.link.subscribe(Commit, lambda _, message: self.commits.append(message))
+        self.link.subscribe(CompositeReward, self._scored)
+        self.link.node.create_subscription(
+            DiagnosticArray,
+            '/diagnostics',
+            lambda array: self.link.store(self._diagnosed, array),
+            10,
+        )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.link.close()
+        rclpy.try_shutdown()
+
+    def _hear(self, _: type, said: Presence) -> None:
+        self.presence[said.node.rsplit('/', 1)[1]] = said
+
+    def _scored(self, _: type, message: Any) -> None:
+        self.scores.append(messages.from_message(message))
+
+    def _diagnosed(self, array: DiagnosticArray) -> None:
+        for status in array.status:
+            values = {value.key: value.value for value in status.values}
+            self.counters[status.hardware_id] = values
+
+    def until(self, found: Callable[[], Any]) -> Any:
+        """Listen until `found()` is true; what it returns."""
+        end = time.monotonic() + PATIENCE
+        while time.monotonic() < end:
+            self.link.drain(0.05)
+            while self.link.inbox:
+                self.link.inbox.popleft()()
+            if result := found():
+                return result
+        logs = '\n'.join(
+            f'--- {path.name}\n{path.read_text()[-2000:]}'
+            for path in sorted((self._nodes.folder / run_folder.LOGS).glob('*.log'))
+        )
+        raise AssertionError(f'not within {PATIENCE:g} s; codes {self._nodes.codes()}\n{logs}')
+
+    def committed(self, phase: int) -> bool:
+        """Whether a phase is committed."""
+        return any(commit.phase >= phase for commit in self.commits)
+
+    def say(self, *records: Record) -> None:
+        """Publish records as if this were a node of the run, once all readers are matched."""
+        publishers = {}
+        for kind in dict.fromkeys(map(type, records)):
+            topic = TOPICS[kind]
+            publishers[kind] = self.link.node.create_publisher(
+                messages.message_type(kind), topic, qos.profile(topic)
+            )
+        self.until(
+            lambda: all(
+                publisher.get_subscription_count() == len(self.readers(TOPICS[kind])) > 0
+                for kind, publisher in publishers.items()
+            )
+        )
+        now = self.link.node.get_clock().now().to_msg()
+        for record in records:
+            publishers[type(record)].publish(messages.to_message(record, now))
+
+    def readers(self, topic: str) -> set[str]:
+        """Names of the nodes that subscribe to a topic of the run."""
+        full = self.link.node.resolve_topic_name(topic)
+        return {info.node_name for info in self.link.node.get_subscriptions_info_by_topic(full)}
+
+    def parameters(self, node: str) -> dict[str, tuple[Any, Any]]:
+        """A node's parameters through the services that `ros2 param` uses: value and descriptor
+        by name.
+        """
+        client = AsyncParameterClient(self.link.node, f'{NAMESPACE}/{node}')
+        self.until(client.services_are_ready)
+
+        def answer(future: Any) -> Any:
+            self.until(future.done)
+            return future.result()
+
+        names = sorted(answer(client.list_parameters()).result.names)
+        values = answer(client.get_parameters(names)).values
+        descriptors = answer(client.describe_parameters(names)).descriptors
+        return {
+            name: (rclpy.parameter.parameter_value_to_python(value), descriptor)
+            for name, value, descriptor in zip(names, values, descriptors, strict=True)
+        }

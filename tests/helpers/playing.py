@@ -1,0 +1,135 @@
+"""Nodes as processes, and peers that a test plays itself over real topics."""
+
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from codetr_ros.records import TOPICS, Presence, RunSpec
+from codetr_ros.ros import peers
+from codetr_ros.ros.link import Link
+from helpers.builders import policy, score, task_spec, transitions
+
+MODULES = {
+    'record': 'codetr_ros.ros.record',
+    'sim': 'sim_node.sim',
+    'learner': 'learner_node.learner',
+    'reward': 'reward_node.reward',
+    'deaf': 'deaf.py',
+}
+NAMESPACE = '/r'
+PATIENCE = 60.0  # discovery and imports on a busy machine
+
+
+@contextmanager
+def process(role: str, *parameters: str, name: str | None = None):
+    """A node of this role in the namespace of the test; killed at the end if it has not ended."""
+    module = MODULES[role]
+    path = Path(__file__).with_name(module)
+    start = [str(path)] if path.is_file() else ['-m', module]
+    command = [sys.executable, *start, '--ros-args', '-r', f'__ns:={NAMESPACE}']
+    command += ['-r', f'__node:={name}'] if name else []
+    for parameter in parameters:
+        command += ['-p', parameter]
+    node = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        yield node
+    finally:
+        if node.poll() is None:
+            node.kill()
+        node.communicate()
+
+
+def output(node: subprocess.Popen) -> str:
+    return node.communicate(timeout=PATIENCE)[0]
+
+
+class Play:
+    """Peers played by the test: they say that they are there and publish what they are told to."""
+
+    def __init__(self, settings, roles=('learner', 'sim', 'reward'), run_id='run'):
+        self.settings = settings
+        self.spec = settings.run_spec(run_id)
+        self.heard = []
+        self.links = {role: Link(role) for role in roles}
+        for role, link in self.links.items():
+            link.advertise(['presence', *peers.published_by(role)], settings)
+            for kind in TOPICS:
+                if role in peers.READERS.get(TOPICS[kind], ()) or kind in (Presence, RunSpec):
+                    link.subscribe(
+                        kind,
+                        lambda kind, message, role=role: self.heard.append((role, message)),
+                        settings,
+                    )
+        self.finished = False
+        self.claimed = {}
+        if 'learner' in roles:
+            self.links['learner'].publish(self.spec)
+
+    def say(self):
+        for role, link in self.links.items():
+            topics = peers.published_by(role)
+            counts = [link.published[t] + self.claimed.get(t, 0) for t in topics]
+            link.publish(
+                Presence(
+                    self.spec.run_id, role, link.full_name, f'{role} of the test',
+                    self.spec.settings_hash,
+                    self.finished, topics, np.array(counts, np.uint64), 0,
+                )
+            )  # fmt: skip
+
+    def until(self, found, node=None):
+        """Spin, saying presence, until `found()` is true; returns what it returns."""
+        end, said = time.monotonic() + PATIENCE, 0.0
+        while time.monotonic() < end:
+            assert node is None or node.poll() is None, output(node)
+            if time.monotonic() - said > 0.3:
+                said = time.monotonic()
+                self.say()
+            for link in self.links.values():
+                link.drain(0.01)
+                while link.inbox:
+                    link.inbox.popleft()()
+            if result := found():
+                return result
+        raise AssertionError(
+            f'not within {PATIENCE} s; heard {[type(m).__name__ for _, m in self.heard][-20:]}'
+        )
+
+    def messages(self, kind, role=None):
+        return [m for r, m in self.heard if type(m).__name__ == kind and role in (None, r)]
+
+    def presence_of(self, role):
+        return [
+            m
+            for m in self.messages('Presence')
+            if m.role == role and 'of the test' not in m.instance_id
+        ]
+
+    def close(self):
+        for link in self.links.values():
+            link.close()
+
+
+def one_phase(play):
+    """What a run of one phase of five steps publishes, up to its commit."""
+    sim, learner = play.links['sim'], play.links['learner']
+    sim.publish(task_spec())
+    learner.publish(policy(steps=np.array([5], np.uint32)))
+    sim.publish(transitions(phase_end=True, scores_due=1))
+    sim.publish(score(length=5))
+    return play.until(lambda: play.messages('Commit', 'learner'))[0]
+
+
+def everybody_matched(play):
+    """Whether the recorder reads what the test publishes."""
+    return not play.links['sim'].unmatched(
+        ['transitions', 'composite_rewards', 'task'],
+        lambda _: {f'{NAMESPACE}/record'},
+        readers=True,
+    ) and not play.links['reward'].unmatched(
+        ['step_rewards'], lambda _: {f'{NAMESPACE}/record'}, readers=True
+    )

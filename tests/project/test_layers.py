@@ -1,0 +1,31 @@
+"""The order of the library's folders, as pyproject.toml states it, holds over every import."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+from importlinter.cli import lint_imports
+
+ROOT = Path(__file__).resolve().parents[2]
+LIBRARY = ROOT / 'codetr_ros' / 'codetr_ros'
+
+
+def test_each_folder_imports_lower_ones_only_and_ros_stays_inside_its_folder(monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)
+    status = lint_imports(config_filename='pyproject.toml', cache_dir=None)
+    assert status == 0, capsys.readouterr().out
+
+
+def test_the_library_has_at_most_three_loose_modules():
+    assert len(list(LIBRARY.glob('*.py'))) <= 3
+
+
+def test_learning_imports_without_ros(tmp_path):
+    program = (
+        "import sys\nsys.modules['rclpy'] = sys.modules['codetr_msgs'] = None\n"
+        'from codetr_ros.cores import in_process\n'
+        'from codetr_ros.offline import fitting, labelling\n'
+        'from codetr_ros.benchmark import report, run\n'
+        'import codetr_ros.cli\n'
+    )
+    subprocess.run([sys.executable, '-c', program], check=True, cwd=tmp_path, timeout=120)

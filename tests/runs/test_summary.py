@@ -1,0 +1,445 @@
+import csv
+import io
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.bags import ours
+from helpers.builders import step_rewards
+
+from codetr_ros import config
+from codetr_ros.cli import train
+from codetr_ros.config import Settings
+from codetr_ros.processes.supervise import Interrupts
+from codetr_ros.records import Commit, EpisodeResult, Presence, Record, metrics
+from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs import report, summary
+from codetr_ros.runs.progress import Progress, duration
+from codetr_ros.runs.summary import Summary
+
+SETTINGS = config.load('quick').changed(
+    {'steps': 2500, 'phase_steps': 1000, 'evaluate_every': 1000, 'evaluate_episodes': 2}
+)
+
+
+class Clock:
+    """Time that passes when told to."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def commit(phase: int) -> Commit:
+    return Commit('r', phase, ('sim',), np.array([9]), ('sim',), np.array([3]), ())
+
+
+def episode(**changes: Any) -> EpisodeResult:
+    made = EpisodeResult('r', 'evaluate', 'evaluation', 1000, 0, 0, 40, 80.0, 60.0, 0.5, True)
+    return replace(made, **changes)
+
+
+def a_run(settings: Settings = SETTINGS) -> list[Record]:
+    """A run of 2500 steps: three phases, evaluations after 1000, 2000 and 2500 steps."""
+    said: list[Record] = []
+    for i, true in enumerate((10.0, 30.0)):
+        said.append(episode(purpose='random', step=0, version=-1, episode=i, true_return=true))
+    for phase, step in enumerate((1000, 2000, 2500)):
+        said.append(commit(phase))
+        said.append(
+            metrics(
+                'r', 'learner', '/run_r/learner', phase, step, {'critic_loss': 1 / (phase + 1)}
+            )
+        )
+        said.append(metrics('r', 'sim', 'sim', phase, step, {'simulate_seconds': 0.5}))
+        said.append(episode(purpose='training', source='sim', step=step - 1, true_return=50.0))
+        for i, true in enumerate((100.0 * phase, 100.0 * phase + 50)):
+            said.append(
+                episode(step=step, version=phase, episode=i, true_return=true, score=true / 1000)
+            )
+    return said
+
+
+REPORTS: dict[str, dict[str, Any]] = {
+    'sim-sim': {
+        'role': 'sim',
+        'published': {'task': 1, 'transitions': 100},
+        'peak_rss_mb': 80.5,
+        'cpu_s': 2.5,
+        'wall_s': 9.0,
+        'finished': True,
+        'error': None,
+    },
+    'learner-learner': {
+        'role': 'learner',
+        'published': {'run': 1, 'policy': 4},
+        'received': {'transitions': 99},
+        'lost': {'transitions': 1},
+        'duplicated': {'step_rewards': 2},
+        'policy_sha256': 'abc',
+        'updates': 1500,
+        'counters': {'labels of evicted steps': 7},
+    },
+    'reward-reward': {
+        'role': 'reward',
+        'published': {'step_rewards': 3},
+        'received': {'transitions': 100, 'composite_rewards': 60},
+        'lost': {'composite_rewards': 5},
+        'refused': {'composite_rewards': 4},
+        'reward_model_sha256': 'def',
+        'gradient_steps': 240,
+    },
+    'record-record': {'role': 'record', 'recorded': {'transitions': 98}, 'bag': '/runs/x/bag'},
+}
+
+
+def built(**changes: Any) -> dict[str, Any]:
+    clock = Clock()
+    made = Summary(SETTINGS, 'r', in_process=False, clock=clock)
+    for record in a_run():
+        made.receive(record)
+    clock.now += 50
+    return made.build(REPORTS, **changes)
+
+
+def test_a_summary_says_what_was_run_and_what_came_out() -> None:
+    said = built()
+
+    for key, value in {
+        'run_id': 'r',
+        'task': 'InvertedDoublePendulum-v5',
+        'composite': 'sum',
+        'delay': 25,
+        'method': 'codetr',
+        'seed': 0,
+        'steps': 2500,
+        'phases': 3,
+        'wall_s': 50.0,
+        'steps_per_s': 50.0,
+        'policy_sha256': 'abc',
+        'reward_model_sha256': 'def',
+        'updates': 1500,
+        'gradient_steps': 240,
+        'bag': '/runs/x/bag',
+        'interrupted': False,
+        'in_process': False,
+        'failure': None,
+        'settings_hash': SETTINGS.hash(),
+    }.items():
+        assert said[key] == value, key
+    assert Settings.model_validate(said['settings']) == SETTINGS
+    assert said['versions']['torch'].startswith('2.')
+    assert json.loads(json.dumps(said)) == said
+
+
+def test_each_evaluation_has_means_and_spread_over_its_episodes() -> None:
+    said = built()
+
+    assert [row['step'] for row in said['evaluations']] == [1000, 2000, 2500]
+    assert said['evaluations'][-1] == {
+        'step': 2500,
+        'version': 2,
+        'true_return_mean': 225.0,
+        'true_return_std': 25.0,
+        'true_return_min': 200.0,
+        'true_return_max': 250.0,
+        'composite_return_mean': 60.0,
+        'score_mean': pytest.approx(0.225),
+        'score_std': pytest.approx(0.025),
+        'length_mean': 40.0,
+        'episodes': 2,
+    }
+    assert said['final_score'] == pytest.approx(0.225)
+    assert said['final_true_return'] == 225.0
+    assert said['random_score'] == 0.5
+    assert said['random_true_return'] == 20.0
+
+
+def test_messages_are_counted_by_topic_over_all_nodes() -> None:
+    said = built()
+
+    assert said['messages']['transitions'] == {
+        'published': 100,
+        'recorded': 98,
+        'received_by_learner': 99,
+        'received_by_reward': 100,
+        'lost': 1,
+        'duplicated': 0,
+        'refused': 0,
+    }
+    assert said['messages']['composite_rewards']['refused'] == 4
+    assert said['messages']['composite_rewards']['lost'] == 5
+    assert said['messages']['true_rewards']['published'] == 0, 'a silent topic is there with zeros'
+    assert (said['lost'], said['duplicated'], said['refused']) == (6, 2, 4)
+
+
+def test_what_each_process_took_is_listed_this_one_included() -> None:
+    said = built()
+
+    assert said['processes']['sim-sim']['peak_rss_mb'] == 80.5
+    assert said['processes']['sim-sim']['cpu_s'] == 2.5
+    assert said['processes']['codetr']['peak_rss_mb'] > 1
+    assert said['counters'] == {'learner-learner': {'labels of evicted steps': 7}}
+
+
+def test_a_run_that_was_stopped_at_once_has_a_summary_too() -> None:
+    said = Summary(SETTINGS, 'r', in_process=True).build({}, interrupted=True)
+
+    assert said['interrupted']
+    assert (said['steps'], said['phases'], said['steps_planned']) == (0, 0, 2500)
+    assert said['final_score'] is None
+    assert said['policy_sha256'] is None
+    assert said['bag'] is None
+    report.page(said, report.draw(said))
+
+
+def test_numbers_that_json_has_no_word_for_become_null() -> None:
+    assert summary.finite({'a': [1.0, float('nan')], 'b': (float('inf'),), 'c': 'x', 'd': 3}) == {
+        'a': [1.0, None],
+        'b': [None],
+        'c': 'x',
+        'd': 3,
+    }
+
+
+def table(text: str) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(text)))
+
+
+def test_metrics_have_a_row_for_each_phase_and_a_column_for_each_number() -> None:
+    made = Summary(SETTINGS, 'r', in_process=False)
+    for record in reversed(a_run()):
+        made.receive(record)
+
+    rows = table(made.metrics_csv())
+
+    assert [row['step'] for row in rows] == ['0', '1000', '2000', '2500']
+    assert [row['phase'] for row in rows] == ['', '0', '1', '2']
+    assert [row['evaluation.true_return_mean'] for row in rows] == [
+        '20.0',
+        '25.0',
+        '125.0',
+        '225.0',
+    ]
+    assert [row['learner.critic_loss'] for row in rows] == ['', '1.0', '0.5', repr(1 / 3)]
+    assert [row['training.true_return_mean'] for row in rows] == ['', '50.0', '50.0', '50.0']
+    assert [row['sim.simulate_seconds'] for row in rows] == ['', '0.5', '0.5', '0.5']
+
+
+def test_several_nodes_of_a_role_get_columns_of_their_own() -> None:
+    made = Summary(SETTINGS, 'r', in_process=False)
+    made.receive(metrics('r', 'sim', '/run_r/sim', 0, 1000, {'simulate_seconds': 1.0}))
+    made.receive(metrics('r', 'sim', '/run_r/sim_2', 0, 1000, {'simulate_seconds': 2.0}))
+
+    (row,) = table(made.metrics_csv())
+
+    assert (row['sim.simulate_seconds'], row['sim_2.simulate_seconds']) == ('1.0', '2.0')
+
+
+def test_the_report_is_one_file_that_holds_picture_tables_and_settings(tmp_path: Path) -> None:
+    report.write(tmp_path, built(failure='learner <died>'))
+
+    page = (tmp_path / run_folder.REPORT).read_text()
+    assert (tmp_path / run_folder.PICTURE).read_bytes().startswith(b'\x89PNG')
+    assert 'src="data:image/png;base64,iVBOR' in page
+    assert not re.search(r'(src|href)="(?!data:)', page), 'nothing is fetched from elsewhere'
+    assert 'learner &lt;died&gt;' in page
+    assert '<td>composite_rewards</td>' in page
+    assert '<tr><td>codetr.learning_rate</td><td>0.001</td></tr>' in page
+    assert '<td>225</td>' in page
+
+
+@pytest.mark.parametrize(
+    ('rows', 'shown'),
+    [
+        ([], 'no labels were compared'),
+        ([(4000, 0.125, 0.5)], 'correlation 0.12, within segments 0.50'),
+        ([(4000, 0.125, None)], 'correlation 0.12'),
+        ([(2000, 0.125, None)], 'correlation 0.12, after 2000 steps'),
+        ([(2000, 0.9, 0.9), (4000, None, None)], 'not defined where one side does not vary'),
+    ],
+)
+def test_the_report_tells_the_last_reward_recovery(rows, shown):
+    names = 'step', 'pearson', 'within'
+    said = built() | {
+        'evaluations': [{'step': 4000, 'true_return_std': 1.0}],
+        'reward_recovery': [dict(zip(names, row, strict=True)) for row in rows],
+    }
+    assert dict(report.result_rows(said))['reward recovery'] == shown
+
+
+@pytest.mark.parametrize(
+    ('encoding', 'shown'), [('utf-8', '▁▄█▁'), ('ascii', '.=@.'), (None, '.=@.')]
+)
+def test_the_sketch_of_a_curve_fits_the_terminal(encoding: str | None, shown: str) -> None:
+    assert report.sketch([0, 50, 110, 0], encoding) == shown
+    assert report.sketch([3.0, 3.0], 'utf-8') == '▁▁'
+
+
+def test_what_is_learnt_about_a_run_that_has_ended_takes_none_of_its_time():
+    clock = Clock()
+    made = Summary(SETTINGS, 'r', in_process=False, clock=clock)
+    clock.now += 50
+    made.end()
+    clock.now += 7
+    assert made.build({})['wall_s'] == 50
+
+
+def test_a_summary_on_disk_is_what_was_built(tmp_path: Path) -> None:
+    said = built()
+
+    summary.write(tmp_path, said, 'step\n0\n')
+
+    assert json.loads((tmp_path / 'summary.json').read_text()) == said
+    assert (tmp_path / 'metrics.csv').read_text() == 'step\n0\n'
+
+
+def presence(node: str, missed: int = 0) -> Presence:
+    published = np.array([1], np.uint64)
+    return Presence('r', 'sim', node, 'i', '', False, ('task',), published, missed)
+
+
+def test_progress_shows_what_nodes_say_that_they_lack() -> None:
+    clock, stream = Clock(), io.StringIO()
+    progress = Progress(SETTINGS, stream, live=False, clock=clock)
+    progress.receive(presence('/r/sim'))
+    progress.receive(presence('/r/reward', missed=2))
+    progress.receive(presence('/r/learner', missed=3))
+    progress.receive(presence('/r/reward'))  # it has come after all
+    clock.now += 10
+    progress.tick()
+
+    assert progress.lost == 3
+    assert 'lost messages 3' in stream.getvalue()
+
+
+def test_progress_without_a_terminal_says_a_line_for_each_evaluation_and_few_others() -> None:
+    clock, stream = Clock(), io.StringIO()
+    with Progress(SETTINGS, stream, live=False, clock=clock) as progress:
+        for record in a_run():
+            clock.now += 1
+            progress.receive(record)
+            progress.receive(presence('sim'))
+
+    lines = stream.getvalue().splitlines()
+    evaluations = [line for line in lines if line.startswith(('random policy', 'after'))]
+    assert evaluations == [
+        'random policy: true return 20.0 +- 10.0, score 0.500 (2 episodes)',
+        'after 1000 steps: true return 25.0 +- 25.0, score 0.025 (2 episodes)',
+        'after 2000 steps: true return 125.0 +- 25.0, score 0.125 (2 episodes)',
+        'after 2500 steps: true return 225.0 +- 25.0, score 0.225 (2 episodes)',
+    ]
+    assert len(lines) - len(evaluations) <= 4, 'one in five seconds'
+    assert any(line.startswith('phase 3 of 3, steps 2500 of 2500') for line in lines)
+
+
+def test_progress_knows_speed_and_time_left() -> None:
+    clock = Clock()
+    progress = Progress(SETTINGS, io.StringIO(), live=False, clock=clock)
+    assert progress.seconds_left is None
+    for phase in (0, 1):
+        clock.now += 10
+        progress.receive(commit(phase))
+
+    assert progress.steps == 2000
+    assert progress.rate == pytest.approx(100)
+    assert progress.seconds_left == pytest.approx(5)
+
+
+def test_progress_on_a_terminal_shows_phase_evaluation_losses_and_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv('TERM', 'xterm')
+    monkeypatch.setenv('COLUMNS', '120')
+    stream = io.StringIO()
+    with Progress(SETTINGS, stream, live=True, clock=Clock()) as progress:
+        progress.receive(presence('/run_r/sim'))
+        for record in a_run():
+            progress.receive(record)
+
+    shown = re.sub(r'\x1b\[[^A-Za-z]*[A-Za-z]', '', stream.getvalue())
+    for text in (
+        '3 of 3',
+        '2500 of 2500',
+        'nodes: sim',
+        'score 0.225',
+        'critic loss',
+        'lost messages',
+    ):
+        assert text in shown, text
+
+
+@pytest.mark.parametrize(
+    ('seconds', 'said'), [(0, '0 s'), (59.4, '59 s'), (185, '3:05 min'), (7800, '2:10 h')]
+)
+def test_durations_are_said_as_people_do(seconds: float, said: str) -> None:
+    assert duration(seconds) == said
+
+
+def told(made: Summary) -> tuple[dict[str, Any], str]:
+    """What is said of a run, without what its process takes."""
+    return {k: v for k, v in made.build({}).items() if k != 'processes'}, made.metrics_csv()
+
+
+def test_a_run_that_is_told_twice_and_in_another_order_is_the_same_run():
+    once, twice = Summary(SETTINGS, 'r', False, Clock()), Summary(SETTINGS, 'r', False, Clock())
+    for record in a_run():
+        once.receive(record)
+    for record in [*reversed(a_run()), *a_run()]:
+        twice.receive(record)
+    assert told(once) == told(twice)
+
+
+def test_what_was_not_heard_is_taken_from_the_bag(tmp_path):
+    """Who listens to a run may be found after its first messages have gone out."""
+    bag = ours(tmp_path / run_folder.BAG, a_run())
+    heard, late = Summary(SETTINGS, 'r', False, Clock()), Summary(SETTINGS, 'r', False, Clock())
+    stream = io.StringIO()
+    progress = Progress(SETTINGS, stream, live=False, clock=Clock())
+    for record in a_run():
+        heard.receive(record)
+    for record in a_run()[3:]:
+        late.receive(record)
+    assert late.build({})['random'] is None
+    train._complete(late, tmp_path, progress, Interrupts())
+    assert told(late) == told(heard)
+    assert stream.getvalue().splitlines() == ['reading the bag for the summary']
+
+    file = next(bag.glob('*.mcap'))
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    train._complete(late, tmp_path, progress, Interrupts())
+    assert told(late) == told(heard)
+    assert 'what was heard' in stream.getvalue()
+
+
+def test_ctrl_c_ends_the_reading_of_the_bag_and_the_summary_is_written_all_the_same(tmp_path):
+    ours(tmp_path / run_folder.BAG, a_run())
+    interrupts = Interrupts()
+
+    class Impatient(io.StringIO):
+        """Of somebody who interrupts whatever is said."""
+
+        def write(self, text: str) -> int:
+            interrupts.count += 1
+            return super().write(text)
+
+    stream, late = Impatient(), Summary(SETTINGS, 'r', False, Clock())
+    progress = Progress(SETTINGS, stream, live=False, clock=Clock())
+    train._complete(late, tmp_path, progress, interrupts)
+    assert 'stopped: the summary holds what was read until now' in stream.getvalue()
+    assert late.build({})['evaluations'] == []
+
+
+def test_reward_recovery_without_all_true_rewards_is_said_not_to_be_told(tmp_path):
+    ours(tmp_path / run_folder.BAG, [*a_run(), step_rewards(phase=0, source='sim')])
+    stream, late = io.StringIO(), Summary(SETTINGS, 'r', False, Clock())
+    progress = Progress(SETTINGS, stream, live=False, clock=Clock())
+    train._complete(late, tmp_path, progress, Interrupts())
+    assert "cannot be told to the end: 'sim' told no true rewards" in stream.getvalue()
+    assert late.build({})['evaluations'], 'all else is told'
