@@ -2,12 +2,12 @@ import weakref
 
 import numpy as np
 import pytest
-from helpers.builders import step_rewards, tiny
 from scipy import stats
 
 from codetr_ros.cores import in_process
 from codetr_ros.records import Record, StepRewards, TrueRewards
 from codetr_ros.runs.recovery import Recovery, RecoveryError
+from helpers.builders import step_rewards, tiny
 
 SETTINGS = tiny(delay=2, steps=600, phase_steps=100, warmup_steps=100, evaluate_every=100)
 

@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.bags import ours
-from helpers.builders import step_rewards
 
 from codetr_ros import config
 from codetr_ros.cli import train
@@ -20,6 +18,8 @@ from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import report, summary
 from codetr_ros.runs.progress import Progress, duration
 from codetr_ros.runs.summary import Summary
+from helpers.bags import ours
+from helpers.builders import step_rewards
 
 SETTINGS = config.load('quick').changed(
     {'steps': 2500, 'phase_steps': 1000, 'evaluate_every': 1000, 'evaluate_episodes': 2}

@@ -22,7 +22,7 @@ import safetensors
 import safetensors.torch
 import torch
 
-from codetr_ros.system.files import (sync_folder, write_synced)
+from codetr_ros.system.files import sync_folder, write_synced
 
 TENSORS = 'tensors.safetensors'
 DESCRIPTION = 'checkpoint.json'

@@ -5,7 +5,9 @@ import os
 import re
 from pathlib import Path
 from typing import Any
+
 import yaml
+
 from codetr_ros import config
 from codetr_ros.system.files import atomic_write
 
@@ -169,4 +171,3 @@ def read_reports(folder: Path) -> dict[str, dict[str, Any]]:
         RunFolderError: one of them is damaged.
     """
     return {path.stem: read_report(path) for path in sorted((folder / NODES).glob('*.json'))}
-

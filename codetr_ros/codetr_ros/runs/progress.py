@@ -15,8 +15,8 @@ from rich.table import Table
 from rich.text import Text
 
 from codetr_ros.config import Settings
+from codetr_ros.records import Commit, EpisodeResult, Metrics, Presence, Record
 from codetr_ros.runs.display import Display
-from codetr_ros.records import (Commit, EpisodeResult, Metrics, Presence, Record)
 
 _RATE_WINDOW = 5  # phases over which the present speed is measured
 

@@ -7,7 +7,7 @@ back from it: neither learner nor reward model can see what it sees.
 import numpy as np
 
 from codetr_ros.config import Settings
-from codetr_ros.records import (F32, I64, Record, StepRewards, TrueRewards)
+from codetr_ros.records import F32, I64, Record, StepRewards, TrueRewards
 
 
 class RecoveryError(ValueError):
@@ -162,7 +162,9 @@ class Recovery:
     def _compare(self, step: int, version: int) -> None:
         if not self._complete:
             return
-        from codetr_ros.runs.recovery_metrics import flat_recovery  # scipy takes a second to import
+        from codetr_ros.runs.recovery_metrics import (
+            flat_recovery,  # scipy takes a second to import
+        )
 
         only = version if self._settings.relabels_all else None
         found = [source.labelled(only) for _, source in sorted(self._sources.items())]

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs.pages import STYLE, flat, records, table, text
 from codetr_ros.system.files import atomic_write
-from codetr_ros.runs.pages import (STYLE, flat, records, table, text)
 
 _TRUE, _SCORE = '#1f5fa8', '#b8561c'
 

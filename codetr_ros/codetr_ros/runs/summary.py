@@ -7,22 +7,22 @@ import csv
 import io
 import json
 import math
-import platform
 import resource
 import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib import metadata
 from pathlib import Path
 from typing import Any
+
 import numpy as np
+
+from codetr_ros.config import Settings
+from codetr_ros.records import TOPICS, Commit, EpisodeResult, Metrics, Record
 from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs.recovery import Recovery
 from codetr_ros.system.files import atomic_write
 from codetr_ros.system.versions import versions
-from codetr_ros.config import Settings
-from codetr_ros.records import (TOPICS, Commit, EpisodeResult, Metrics, Record)
-from codetr_ros.runs.recovery import Recovery
 
 Report = Mapping[str, Any]
 
@@ -321,4 +321,3 @@ def write(folder: Path, summary: Mapping[str, Any], metrics_csv: str) -> None:
 def _from_role(reports: Mapping[str, Report], role: str, key: str) -> Any:
     found = [report.get(key) for report in reports.values() if report.get('role') == role]
     return next((value for value in found if value is not None), None)
-
