@@ -8,9 +8,9 @@ from typing import Any
 
 from codetr_ros.benchmark import anchors as trivial
 from codetr_ros.benchmark import curves, scores, sections, table
-from codetr_ros.benchmark.document import Block, Heading, markdown, page
 from codetr_ros.benchmark.folder import Folder
 from codetr_ros.benchmark.results import Result, read
+from codetr_ros.runs.document import Block, Heading, markdown, page
 from codetr_ros.simulation import tasks
 from codetr_ros.system.files import atomic_write
 

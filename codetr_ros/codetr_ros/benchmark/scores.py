@@ -6,10 +6,10 @@ import numpy as np
 
 from codetr_ros.benchmark import paper
 from codetr_ros.benchmark.anchors import Anchors
-from codetr_ros.benchmark.document import Block, Bold, Heading, Items, Paragraph, Table
 from codetr_ros.benchmark.results import Result
 from codetr_ros.benchmark.statistics import CONFIDENCE, REPLICATES, SIGNIFICANCE
 from codetr_ros.benchmark.table import ORACLES, TABLE_DELAYS, Aggregate, Entry, Row, methods
+from codetr_ros.runs.document import Block, Bold, Heading, Items, Paragraph, Table
 
 NONE = '–'
 """Where there is nothing to show."""

@@ -6,7 +6,12 @@ from pathlib import Path
 import numpy as np
 
 from codetr_ros.benchmark import paper
-from codetr_ros.benchmark.document import (
+from codetr_ros.benchmark.folder import Folder
+from codetr_ros.benchmark.results import Result
+from codetr_ros.benchmark.scores import NONE
+from codetr_ros.benchmark.table import methods
+from codetr_ros.config import Settings
+from codetr_ros.runs.document import (
     Block,
     Bold,
     Heading,
@@ -16,11 +21,6 @@ from codetr_ros.benchmark.document import (
     Table,
     Verbatim,
 )
-from codetr_ros.benchmark.folder import Folder
-from codetr_ros.benchmark.results import Result
-from codetr_ros.benchmark.scores import NONE
-from codetr_ros.benchmark.table import methods
-from codetr_ros.config import Settings
 
 
 def _every(results: Sequence[Result], name: str) -> str:

@@ -1,6 +1,5 @@
 """The report of a fit: one HTML page with its pictures."""
 
-import base64
 import io
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -8,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from codetr_ros.config import flatten
 from codetr_ros.offline.judging import Judgement, Shown
 from codetr_ros.offline.results import rows
 from codetr_ros.offline.settings import OF_NO_EFFECT
+from codetr_ros.runs import document
 from codetr_ros.runs import folder as run_folder
-from codetr_ros.runs.pages import STYLE, flat, table, text
+from codetr_ros.runs.document import Block, Heading, Paragraph, Picture, facts
 from codetr_ros.system.files import atomic_write
 
 _TRUE, _INFERRED, _GREY = '#1f5fa8', '#b8561c', '#555'
@@ -37,71 +38,58 @@ def write(folder: Path, summary: Mapping[str, Any], judged: Judgement | None) ->
 
 def page(summary: Mapping[str, Any], judged: Judgement | None) -> str:
     """The HTML page, with everything in it."""
-    parts = [
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">',
-        f'<title>{text(title(summary))}</title><style>{STYLE}</style></head><body>',
-        f'<h1>{text(title(summary))}</h1>',
-        table(['', ''], rows(summary)),
-    ]
+    blocks: list[Block] = [Heading(title(summary), 1), facts(rows(summary))]
     if summary['curve']:
-        parts += ['<h2>Training</h2>', _image('training curve', draw_curve(summary))]
+        blocks += [Heading('Training'), Picture(draw_curve(summary), 'training curve')]
     if judged is not None:
-        parts += _judged(summary, judged)
-    skipped = [[name, n] for name, n in summary['skipped'].items()]
-    parts += [
-        '<h2>Skipped</h2>',
-        table(['what', 'how many'], skipped) if skipped else '<p>nothing</p>',
-        *(f'<p>{text(note)}</p>' for note in summary.get('notes', ())),
-        '<h2>Data</h2>',
-        table(['', ''], [[name, value] for name, value in summary['data'].items()]),
-        '<h2>Settings</h2>',
-        table(
-            ['setting', 'value'],
-            [
-                *([f'fit: {name}', value] for name, value in summary['fit'].items()),
-                *(
-                    row
-                    for row in flat(summary['settings'])
-                    if row[0].partition('.')[0] not in OF_NO_EFFECT
-                ),
-            ],
+        blocks += _judged(summary, judged)
+    skipped = summary['skipped']
+    settings = [
+        *((f'fit: {name}', value) for name, value in summary['fit'].items()),
+        *(
+            (name, value)
+            for name, value in flatten(summary['settings'])
+            if name.partition('.')[0] not in OF_NO_EFFECT
         ),
-        '</body></html>\n',
     ]
-    return '\n'.join(parts)
+    blocks += [
+        Heading('Skipped'),
+        facts(skipped) if skipped else Paragraph('nothing'),
+        *(Paragraph(note) for note in summary.get('notes', ())),
+        Heading('Data'),
+        facts(summary['data']),
+        Heading('Settings'),
+        facts(settings),
+    ]
+    return document.page(blocks)
 
 
-def _judged(summary: Mapping[str, Any], judged: Judgement) -> list[str]:
+def _judged(summary: Mapping[str, Any], judged: Judgement) -> list[Block]:
     what = summary['judged_on']
-    parts = [f'<h2>Composite rewards: predicted and true, {text(what)}</h2>']
+    blocks: list[Block] = [Heading(f'Composite rewards: predicted and true, {what}')]
     if judged.predicted is not None:
-        parts.append(_image('predicted and true composite rewards', draw_composites(judged)))
+        picture = draw_composites(judged)
+        blocks.append(Picture(picture, 'predicted and true composite rewards'))
     else:
-        parts.append('<p>This method predicts no composite rewards.</p>')
-    parts.append(f'<h2>Step rewards: inferred and true, {text(what)}</h2>')
+        blocks.append(Paragraph('This method predicts no composite rewards.'))
+    blocks.append(Heading(f'Step rewards: inferred and true, {what}'))
     if len(judged.true):
-        parts.append(_image('inferred and true step rewards', draw_steps(judged)))
+        blocks.append(Picture(draw_steps(judged), 'inferred and true step rewards'))
     else:
-        parts.append('<p>The bags hold no true step rewards of these segments.</p>')
+        blocks.append(Paragraph('The bags hold no true step rewards of these segments.'))
+    bars = (
+        ' The bars are the attention weights w, which are 1 on average: how much each step '
+        'counts for the score.'
+    )
     weights = any(shown.weights is not None for shown in judged.shown)
-    parts += [
-        '<h2>Some segments, step by step</h2>',
-        '<p>From the lowest to the highest score, evenly chosen.'
-        + (
-            ' The bars are the attention weights w, which are 1 on average: how much each step '
-            'counts for the score.'
-            if weights
-            else ''
-        )
-        + '</p>',
-        _image('segments step by step', draw_segments(judged.shown)),
+    return [
+        *blocks,
+        Heading('Some segments, step by step'),
+        Paragraph(
+            f'From the lowest to the highest score, evenly chosen.{bars if weights else ""}'
+        ),
+        Picture(draw_segments(judged.shown), 'segments step by step'),
     ]
-    return parts
-
-
-def _image(name: str, picture: bytes) -> str:
-    shown = base64.b64encode(picture).decode()
-    return f'<img alt="{name}" src="data:image/png;base64,{shown}">'
 
 
 def _png(size: tuple[float, float], draw: Callable[[Any], None]) -> bytes:

@@ -1,13 +1,14 @@
 """The report of a run for people: a picture of the learning curve and one HTML page."""
 
-import base64
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from codetr_ros.config import flatten
+from codetr_ros.runs import document
 from codetr_ros.runs import folder as run_folder
-from codetr_ros.runs.pages import STYLE, flat, records, table, text
+from codetr_ros.runs.document import Block, Heading, Paragraph, Picture, facts, records
 from codetr_ros.system.files import atomic_write
 
 _TRUE, _SCORE = '#1f5fa8', '#b8561c'
@@ -80,37 +81,35 @@ def draw(summary: Mapping[str, Any]) -> bytes:
 
 def page(summary: Mapping[str, Any], picture: bytes) -> str:
     """The HTML page, with everything in it."""
-    shown = base64.b64encode(picture).decode()
-    parts = [
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">',
-        f'<title>{text(title(summary))}</title><style>{STYLE}</style></head><body>',
-        f'<h1>{text(title(summary))}</h1>',
-        f'<p class="bad">{text(summary["failure"])}</p>' if summary['failure'] else '',
-        f'<img alt="learning curve" src="data:image/png;base64,{shown}">',
-        '<h2>Result</h2>',
-        table(['', ''], [[name, value] for name, value in result_rows(summary)]),
-        '<p>The score is the composite return of an episode over that of an agent that earns the '
-        "task's largest reward at every step.</p>",
-        '<h2>Evaluations</h2>',
-        records(([summary['random']] if summary['random'] else []) + summary['evaluations']),
-        '<h2>Messages</h2>',
-        _messages(summary['messages']),
-        '<h2>Processes</h2>',
-        records([{'process': name, **row} for name, row in summary['processes'].items()]),
-        '<h2>Settings</h2>',
-        table(['setting', 'value'], list(flat(summary['settings']))),
-        '<h2>Identity</h2>',
-        table(
-            ['', ''],
-            [
-                [name, summary[name]]
-                for name in ('run_id', 'policy_sha256', 'reward_model_sha256', 'settings_hash')
-            ]
-            + [[f'version of {name}', value] for name, value in summary['versions'].items()],
+    identity = {
+        name: summary[name]
+        for name in ('run_id', 'policy_sha256', 'reward_model_sha256', 'settings_hash')
+    }
+    versions = {f'version of {name}': value for name, value in summary['versions'].items()}
+    processes = [{'process': name, **row} for name, row in summary['processes'].items()]
+    messages = [{'topic': topic, **row} for topic, row in summary['messages'].items()]
+    blocks: list[Block] = [
+        Heading(title(summary), 1),
+        *([Paragraph(summary['failure'], bad=True)] if summary['failure'] else []),
+        Picture(picture, 'learning curve'),
+        Heading('Result'),
+        facts(result_rows(summary)),
+        Paragraph(
+            'The score is the composite return of an episode over that of an agent that earns the '
+            "task's largest reward at every step."
         ),
-        '</body></html>\n',
+        Heading('Evaluations'),
+        records(([summary['random']] if summary['random'] else []) + summary['evaluations']),
+        Heading('Messages'),
+        records(messages),
+        Heading('Processes'),
+        records(processes),
+        Heading('Settings'),
+        facts(list(flatten(summary['settings']))),
+        Heading('Identity'),
+        facts(identity | versions),
     ]
-    return '\n'.join(part for part in parts if part)
+    return document.page(blocks)
 
 
 def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -177,7 +176,3 @@ def write(folder: Path, summary: Mapping[str, Any]) -> None:
     picture = draw(summary)
     atomic_write(folder / run_folder.PICTURE, picture)
     atomic_write(folder / run_folder.REPORT, page(summary, picture))
-
-
-def _messages(messages: Mapping[str, Mapping[str, int]]) -> str:
-    return records([{'topic': topic, **row} for topic, row in messages.items()])

@@ -1,0 +1,206 @@
+"""A document of headings, paragraphs, lists, tables and pictures, as Markdown and as HTML.
+
+Every report is made of these blocks: that of a run, of a fit and of a benchmark. An HTML page
+needs no network and, where its pictures are given as bytes, no other file.
+"""
+
+import base64
+import html
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+STYLE = """
+:root { color-scheme: light dark }
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto;
+  padding: 0 1rem }
+h1 { font-size: 1.4rem; line-height: 1.3; overflow-wrap: anywhere }
+h2 { font-size: 1.15rem; margin-top: 2.2rem }
+h3 { font-size: 1rem }
+p, li { max-width: 46rem }
+img { max-width: 100%; height: auto; background: #fff }
+pre { background: #8882; padding: .6rem; overflow-x: auto; font-size: .85em }
+.wide { overflow-x: auto }
+table { border-collapse: collapse }
+th, td { padding: .2rem 0 .2rem 1.2rem; border-bottom: 1px solid #8885; text-align: right;
+  white-space: nowrap; font-variant-numeric: tabular-nums }
+th { font-weight: 600 }
+th:first-child, td:first-child { padding-left: 0; text-align: left }
+.facts th, .facts td { text-align: left; white-space: normal; overflow-wrap: anywhere;
+  vertical-align: top }
+.facts td:first-child { min-width: 9rem }
+.bad { color: #d22d3a; font-weight: 600 }
+"""
+
+
+@dataclass(frozen=True)
+class Heading:
+    """A heading; the document's title has level 1."""
+
+    text: str
+    level: int = 2
+
+
+@dataclass(frozen=True)
+class Paragraph:
+    """Running text; `bad` marks a failure."""
+
+    text: str
+    bad: bool = False
+
+
+@dataclass(frozen=True)
+class Items:
+    """A list."""
+
+    texts: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Bold:
+    """A table's cell in boldface."""
+
+    text: str
+
+
+Cell = str | Bold
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of numbers whose first column is text."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Names with their values, a line for each; values may be long."""
+
+    rows: Sequence[tuple[str, str]]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A PNG: a file beside the document, or its bytes, which the HTML page then holds itself."""
+
+    source: str | bytes
+    alt: str
+
+
+@dataclass(frozen=True)
+class Verbatim:
+    """What a program printed."""
+
+    text: str
+
+
+Block = Heading | Paragraph | Items | Table | Facts | Picture | Verbatim
+
+
+def cell(value: Any) -> str:
+    """A value for people: numbers with six digits, sequences with commas, None as nothing."""
+    if value is None:
+        return ''
+    if isinstance(value, float):
+        return f'{value:.6g}'
+    if isinstance(value, (list, tuple)):
+        return ', '.join(map(str, value))
+    return str(value)
+
+
+def facts(rows: Sequence[Sequence[Any]] | Mapping[str, Any]) -> Facts:
+    """Names and values of any kind."""
+    pairs = rows.items() if isinstance(rows, Mapping) else rows
+    return Facts([(str(name), cell(value)) for name, value in pairs])
+
+
+def records(rows: Sequence[Mapping[str, Any]]) -> Block:
+    """A table of rows that have the same names; a word where there is no row."""
+    if not rows:
+        return Paragraph('none')
+    names = list(rows[0])
+    lines = [[cell(row.get(name)) for name in names] for row in rows]
+    return Table([name.replace('_', ' ') for name in names], lines)
+
+
+def markdown(blocks: Sequence[Block]) -> str:
+    """The document as Markdown."""
+    return '\n\n'.join(_markdown(block) for block in blocks) + '\n'
+
+
+def _markdown(block: Block) -> str:
+    match block:
+        case Heading(text, level):
+            return f'{"#" * level} {text}'
+        case Paragraph(text, bad):
+            return f'**{text}**' if bad else text
+        case Items(texts):
+            return '\n'.join(f'- {text}' for text in texts)
+        case Picture(source, alt):
+            if isinstance(source, bytes):
+                raise ValueError(f'picture {alt!r}: Markdown holds no bytes; give it a file name')
+            return f'![{alt}]({source})'
+        case Verbatim(text):
+            return '\n'.join(f'    {line}' for line in text.splitlines())
+        case Table(head, rows):
+            return '\n'.join(_lines([head, ['---', *['---:'] * (len(head) - 1)], *rows]))
+        case Facts(pairs):
+            return '\n'.join(_lines([['', ''], ['---', '---'], *pairs]))
+
+
+def _lines(rows: Sequence[Sequence[Cell]]) -> Iterator[str]:
+    for row in rows:
+        yield f'| {" | ".join(_markdown_cell(each) for each in row)} |'
+
+
+def _markdown_cell(each: Cell) -> str:
+    if isinstance(each, Bold):
+        return f'**{_markdown_cell(each.text)}**'
+    return each.replace('|', '\\|').replace('\n', ' ')
+
+
+def page(blocks: Sequence[Block]) -> str:
+    """The document as an HTML page. Its title is its first heading."""
+    title = next(block.text for block in blocks if isinstance(block, Heading))
+    return '\n'.join(
+        [
+            '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">',
+            '<meta name="viewport" content="width=device-width, initial-scale=1">',
+            f'<title>{html.escape(title)}</title><style>{STYLE}</style></head><body>',
+            *(_html(block) for block in blocks),
+            '</body></html>\n',
+        ]
+    )
+
+
+def _html(block: Block) -> str:
+    match block:
+        case Heading(text, level):
+            return f'<h{level}>{html.escape(text)}</h{level}>'
+        case Paragraph(text, bad):
+            return f'<p{" class=bad" if bad else ""}>{html.escape(text)}</p>'
+        case Items(texts):
+            return f'<ul>{"".join(f"<li>{html.escape(text)}</li>" for text in texts)}</ul>'
+        case Picture(source, alt):
+            if isinstance(source, bytes):
+                source = f'data:image/png;base64,{base64.b64encode(source).decode()}'
+            return f'<img alt="{html.escape(alt)}" src="{html.escape(source)}">'
+        case Verbatim(text):
+            return f'<pre>{html.escape(text)}</pre>'
+        case Table(head, rows):
+            top = ''.join(f'<th>{html.escape(name)}</th>' for name in head)
+            return f'<div class="wide"><table><tr>{top}</tr>\n{_rows(rows)}</table></div>'
+        case Facts(pairs):
+            return f'<table class="facts">{_rows(pairs)}</table>'
+
+
+def _rows(rows: Sequence[Sequence[Cell]]) -> str:
+    return '\n'.join(
+        f'<tr>{"".join(f"<td>{_html_cell(each)}</td>" for each in row)}</tr>' for row in rows
+    )
+
+
+def _html_cell(each: Cell) -> str:
+    return f'<b>{html.escape(each.text)}</b>' if isinstance(each, Bold) else html.escape(each)
