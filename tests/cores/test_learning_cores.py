@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from codetr_ros.cores import in_process
-from codetr_ros.cores.labeller import PART_BYTES, Labeller
+from codetr_ros.cores.labeller import Labeller
 from codetr_ros.cores.learner import Learner
 from codetr_ros.learners.base import LearnerError
 from codetr_ros.records import (
+    MESSAGE_BYTES,
     Metrics,
     Policy,
     RecordError,
@@ -122,7 +123,7 @@ def test_labels_travel_in_parts_well_below_the_shared_memory_segment():
     Endless(settings).phase(core, 0)
     parts = [r for r in slices(work) if isinstance(r, StepRewards)]
     assert len(parts) == 3 and sum(len(p.labels) for p in parts) == 30_000
-    assert all(p.labels.nbytes + 3 * p.lengths.nbytes <= PART_BYTES for p in parts)
+    assert all(p.labels.nbytes + 3 * p.lengths.nbytes <= MESSAGE_BYTES for p in parts)
 
 
 def learner(**changes):

@@ -13,6 +13,7 @@ from codetr_ros.cores.simulator import Simulator, ThreadChoice
 from codetr_ros.policy.acting import ActingPolicy
 from codetr_ros.policy.actor import Actor, describe, weights_bytes
 from codetr_ros.records import (
+    MESSAGE_BYTES,
     CompositeReward,
     EpisodeResult,
     Metrics,
@@ -24,7 +25,7 @@ from codetr_ros.records import (
 )
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.simulation import tasks
-from codetr_ros.simulation.source import CHUNK_BYTES, CHUNK_STEPS, chunk_steps
+from codetr_ros.simulation.source import CHUNK_STEPS, chunk_steps
 from helpers.builders import policy, same, task_spec, tiny
 from helpers.builders import run as run_spec
 
@@ -466,8 +467,8 @@ def test_a_chunk_fits_into_a_message():
         def size(steps, o=observation_size, a=action_size):
             return 4 * ((steps + 1) * o + steps * a)
 
-        assert size(steps) <= CHUNK_BYTES
-        assert steps == CHUNK_STEPS or size(steps + 1) > CHUNK_BYTES
+        assert size(steps) <= MESSAGE_BYTES
+        assert steps == CHUNK_STEPS or size(steps + 1) > MESSAGE_BYTES
     assert chunk_steps(25_000, 1) == 0
 
 
@@ -476,7 +477,7 @@ def test_chunks_of_many_observations_are_shorter_and_still_whole():
     chunks = kind(Transitions, simulate(settings, [permit(0, steps=400)]))
     assert sum(chunk.steps for chunk in chunks) == 400
     for chunk in chunks:
-        assert chunk.observations.nbytes + chunk.actions.nbytes <= CHUNK_BYTES
+        assert chunk.observations.nbytes + chunk.actions.nbytes <= MESSAGE_BYTES
 
 
 def test_a_delay_beyond_the_horizon_is_refused_before_anything_is_simulated():

@@ -269,7 +269,7 @@ def test_an_episode_of_which_nothing_is_left_leaves_no_gap_in_the_numbers():
 
 
 def test_long_episodes_come_in_chunks_that_join(monkeypatch):
-    monkeypatch.setattr(converting, 'CHUNK_BYTES', 3 * 4 * 2)  # three steps of two numbers
+    monkeypatch.setattr(converting, 'MESSAGE_BYTES', 3 * 4 * 2)  # three steps of two numbers
     steps, _, _ = run(rules(), *commands(*(1 + i / 10 for i in range(8))))
     assert [(s[1], len(s[3]), s[4][1]) for s in steps] == [
         (0, 3, False),

@@ -195,7 +195,7 @@ def test_a_batch_taken_in_parts_teaches_and_labels_as_in_one_go(monkeypatch, row
     torch.set_default_dtype(torch.float32)
     found = []
     for size in (1 << 30, 4000):
-        monkeypatch.setattr(sequence, 'PART_BYTES', size)
+        monkeypatch.setattr(sequence, 'ARRAY_BYTES', size)
         made = Codetr(builders.tiny(codetr__dropout=0.0), O, A)
         given = batch(rows)
         assert [len(p.lengths) for p in made._parts(given)] == (

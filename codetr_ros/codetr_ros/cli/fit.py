@@ -178,7 +178,7 @@ def _epochs(arguments: Sequence[str], given: Arguments) -> int:
         'phase': 0,
     }
     checkpoints.save(folder / run_folder.CHECKPOINTS, 'reward', 0, fitted.method.state(), meta)
-    judged = judging.judge(fitted.method, fitted.held_out, judging.unit(fitted.method, settings))
+    judged = judging.judge(fitted.method, fitted.held_out)
     summary = results.of_epochs(fitted, index, found, settings, given.fit, judged)
     results.write(folder, summary)
     report.write(folder, summary, judged)
@@ -263,8 +263,7 @@ def _phases(arguments: Sequence[str], given: Arguments) -> int:
         newest = list(loading.newest(found.found, given.settings.memory_steps))
         sizes = index.observation_size, index.action_size
         loaded = loading.load(index.bags, newest, sizes, own.delay, true_rewards=True)
-        unit = judging.unit(folded.core.method, given.settings)
-        judged = judging.judge(folded.core.method, loaded, unit)
+        judged = judging.judge(folded.core.method, loaded)
     summary = results.of_phases(folded, index, found, own, given.fit, judged, seconds, live)
     results.write(folder, summary)
     report.write(folder, summary, judged)

@@ -16,6 +16,7 @@ from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import (
     F32,
     I64,
+    MESSAGE_BYTES,
     Commit,
     CompositeReward,
     Record,
@@ -29,9 +30,6 @@ from codetr_ros.rewards import registry, saved
 from codetr_ros.rewards.base import RewardMethod, RewardModelError
 from codetr_ros.runs import checkpoints
 from codetr_ros.seeding import generator, seed_torch
-
-PART_BYTES = 200_000
-"""Upper bound of a part's arrays: well inside the 512 KB segment of Fast DDS' shared memory."""
 
 
 class Labeller(Consumer):
@@ -188,7 +186,7 @@ class Labeller(Consumer):
             begin = 0
             while begin < len(lengths):
                 sizes = np.cumsum(lengths[begin:] * 4 + 12)
-                end = begin + max(1, int(np.searchsorted(sizes, PART_BYTES, side='right')))
+                end = begin + max(1, int(np.searchsorted(sizes, MESSAGE_BYTES, side='right')))
                 steps = int(lengths[begin:end].sum())
                 episodes, firsts, counts = (a[begin:end].astype(np.uint32) for a in where)
                 part = labels[at : at + steps].copy()
@@ -217,10 +215,10 @@ class Labeller(Consumer):
         least one, if empty.
         """
         parts: list[list[StepRewards]] = []
-        size = PART_BYTES
+        size = MESSAGE_BYTES
         for piece in sorted(found, key=lambda piece: piece.source):
             weight = len(piece.labels) * 4 + len(piece.lengths) * 12
-            if size + weight > PART_BYTES or parts[-1][0].source != piece.source:
+            if size + weight > MESSAGE_BYTES or parts[-1][0].source != piece.source:
                 parts.append([])
                 size = 0
             parts[-1].append(piece)

@@ -131,31 +131,3 @@ def add(totals: dict[str, Tensor], values: Mapping[str, Tensor]) -> None:
     """Add values to totals of the same names."""
     for name, value in values.items():
         totals[name] = totals.get(name, torch.zeros(())) + value
-
-
-def check_state(learner: str, expected: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> None:
-    """Refuse a state that is not one of this very learner and architecture.
-
-    Args:
-        learner: whose state is expected, for the error.
-        expected: a state of it, for names, shapes and types.
-        given: the state to be loaded.
-
-    Raises:
-        LearnerError: a tensor is missing, unknown, or of another shape or type.
-    """
-    wrong = [f'{name} is missing' for name in expected if name not in given]
-    wrong += [f'{name} is unknown' for name in given if name not in expected]
-    for name in expected.keys() & given.keys():
-        came, due = given[name], expected[name]
-        if (came.shape, came.dtype) != (due.shape, due.dtype):
-            wrong.append(
-                f'{name} is {tuple(came.shape)} {came.dtype}, expected {tuple(due.shape)} '
-                f'{due.dtype}'
-            )
-    if wrong:
-        more = f' and {len(wrong) - 5} more' if len(wrong) > 5 else ''
-        raise LearnerError(
-            f'state of policy learner {learner!r} refused: {"; ".join(sorted(wrong)[:5])}{more}. '
-            'It belongs to other settings or another task: use those it was saved with'
-        )

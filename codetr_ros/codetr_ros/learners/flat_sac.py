@@ -54,18 +54,16 @@ class FlatSAC(SAC):
         super().__init__(observation_size, action_size, settings, seed)
         freed_memory.keep()
         self.batch = settings.batch
-        self.critic_adam = self._critic = FlatAdam(
-            self.critic, settings.critic_learning_rate, device
-        )
-        self.actor_adam = self._actor = FlatAdam(
+        self.critic_adam: FlatAdam = FlatAdam(self.critic, settings.critic_learning_rate, device)
+        self.actor_adam: FlatAdam = FlatAdam(
             list(self.actor.parameters()), settings.actor_learning_rate, device
         )
-        self.temperature_adam = self._temperature = FlatAdam(
+        self.temperature_adam: FlatAdam = FlatAdam(
             [self.log_temperature], settings.temperature_learning_rate, device
         )
-        self.critic_values = self._critic.views(self._critic.flat)
-        self._flat_target = self._critic.flat.clone()
-        self.target = self._critic.views(self._flat_target)
+        self.critic_values = self.critic_adam.views(self.critic_adam.flat)
+        self._flat_target = self.critic_adam.flat.clone()
+        self.target = self.critic_adam.views(self._flat_target)
         self._sums = torch.zeros(len(METRICS), device=device)
         self._step = self._update
         if settings.compile:
@@ -142,10 +140,10 @@ class FlatSAC(SAC):
             noise: standard normal, (2, B, A): of the actions after s', and after s.
         """
         B, A = a.shape
-        actor = _stack_of_one(self._actor.views(self._actor.flat))
-        critic = self._critic.views(self._critic.flat)
-        target = self._critic.views(self._flat_target)
-        alpha = self._temperature.flat.exp().squeeze()
+        actor = _stack_of_one(self.actor_adam.views(self.actor_adam.flat))
+        critic = self.critic_adam.views(self.critic_adam.flat)
+        target = self.critic_adam.views(self._flat_target)
+        alpha = self.temperature_adam.flat.exp().squeeze()
 
         # The policy's actions after s' and s, in one pass.
         actor_hidden = forward(actor, torch.cat([s2, s])[None])
@@ -168,10 +166,10 @@ class FlatSAC(SAC):
             g for x, d in zip(hidden[:-1], by_layer, strict=True) for g in (x.mT @ d, d.sum(1))
         ]
         # the last one is (2, 1, H), the same numbers as (2, H, 1) and twelve times as fast
-        self._critic.descend([*gradients, dq.mT @ hidden[-1], dq.sum(1)])
+        self.critic_adam.descend([*gradients, dq.mT @ hidden[-1], dq.sum(1)])
 
         # Targets follow: Q' <- (1 - tau) Q' + tau Q.
-        self._flat_target.lerp_(self._critic.flat, self.tau)
+        self._flat_target.lerp_(self.critic_adam.flat, self.tau)
 
         # Actor: the mean of alpha log pi(a|s) - min_i Q_i(s, a), a ~ pi(s), under the new critics.
         hidden = forward(critic, pairs(s, a_pi))
@@ -191,11 +189,11 @@ class FlatSAC(SAC):
         gradients = [
             g for x, d in zip(hidden, by_layer, strict=True) for g in (d.mT @ x, d.sum(1))
         ]
-        self._actor.descend(gradients)
+        self.actor_adam.descend(gradients)
 
         # Temperature: alpha (entropy - target entropy), the entropy as the actor's step saw it.
         entropy = -log_prob.mean()
-        self._temperature.descend([alpha * (entropy - self.target_entropy)])
+        self.temperature_adam.descend([alpha * (entropy - self.target_entropy)])
 
         actor_loss = (alpha * log_prob - torch.minimum(q1_pi, q2_pi)).mean()
         critic_loss = error.square().sum(0).mean()

@@ -42,11 +42,12 @@ from torch import Tensor, nn
 
 from codetr_ros import seeding
 from codetr_ros.config import Settings
-from codetr_ros.learners.base import OffPolicy, add, check_state
+from codetr_ros.learners.base import LearnerError, OffPolicy, add
 from codetr_ros.learners.histories import HISTORIES, HistoryBatch, ScoredSteps
 from codetr_ros.learners.sac import Adam, q_values, squashed_gaussian, twin_critic
 from codetr_ros.memory.trajectories import Trajectories, measure_scale
 from codetr_ros.policy.actor import Actor, describe
+from codetr_ros.system.states import check_state
 
 
 class Critic(nn.Module):
@@ -225,7 +226,7 @@ class HC(OffPolicy):
         Raises:
             LearnerError: it is another learner's or architecture's; nothing has changed then.
         """
-        check_state('hc', self.state(), state)
+        check_state("policy learner 'hc'", self.state(), state, LearnerError)
         for name, tensor in self._tensors().items():
             tensor.copy_(state[name])
         self.target_scale = float(state['target_scale'])

@@ -45,7 +45,6 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import torch
@@ -53,7 +52,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from codetr_ros.config import Settings
-from codetr_ros.learners.base import LearnerError, check_state
+from codetr_ros.learners.base import LearnerError
 from codetr_ros.learners.on_policy import (
     DifferentiableAdam,
     RunningMoments,
@@ -65,9 +64,10 @@ from codetr_ros.learners.on_policy import (
 )
 from codetr_ros.memory.ring import Rollout
 from codetr_ros.memory.trajectories import Trajectories
-from codetr_ros.policy.actor import StandardisedActor, describe, orthogonal, standardise
+from codetr_ros.policy.actor import StandardisedActor, describe, layers, orthogonal, standardise
 from codetr_ros.records import F32
 from codetr_ros.seeding import generator, seed_torch
+from codetr_ros.system.states import check_state
 
 KIND = 'standardised_tanh_gaussian_mlp'
 REWARD_CLIP = 10.0
@@ -76,14 +76,12 @@ LARGEST_ACTION = 1 - 1e-6
 """Actions are taken back to before their squash from no nearer to 1 than this."""
 
 
-def perceptron(inputs: int, hidden: Sequence[int], gain: float) -> nn.Sequential:
-    """A tanh network with one output: orthogonal weights, of this gain in the last layer."""
-    body = nn.Sequential()
-    for width, following in pairwise([inputs, *hidden]):
-        body.extend([nn.Linear(width, following), nn.Tanh()])
+def value_network(inputs: int, hidden: Sequence[int]) -> nn.Sequential:
+    """A tanh network with one output and orthogonal weights, of gain 1 in the last layer."""
+    body = layers(inputs, hidden, nn.Tanh)
     orthogonal(body, math.sqrt(2))
     head = nn.Sequential(nn.Linear(hidden[-1], 1))
-    orthogonal(head, gain)
+    orthogonal(head, 1.0)
     return body.extend(head)
 
 
@@ -119,9 +117,9 @@ class Lirpg:
         self.counters: Counter[str] = Counter()
         self.actor = StandardisedActor(observation_size, action_size, own.hidden)
         self.network = describe(observation_size, action_size, own.hidden, kind=KIND)
-        self.value = perceptron(observation_size, own.hidden, 1.0)
-        self.extrinsic_value = perceptron(observation_size, own.hidden, 1.0)
-        self.intrinsic_reward = perceptron(observation_size + action_size, own.hidden, 1.0)
+        self.value = value_network(observation_size, own.hidden)
+        self.extrinsic_value = value_network(observation_size, own.hidden)
+        self.intrinsic_reward = value_network(observation_size + action_size, own.hidden)
         self._policy_names = [name for name, _ in self.actor.named_parameters()]
         self.theta = [*self.actor.parameters(), *self.value.parameters()]
         self.eta = [*self.intrinsic_reward.parameters(), *self.extrinsic_value.parameters()]
@@ -312,7 +310,7 @@ class Lirpg:
             LearnerError: it is another learner's or architecture's; nothing has changed then.
         """
         mine = self._tensors()
-        check_state('lirpg', mine, state)
+        check_state("policy learner 'lirpg'", mine, state, LearnerError)
         for name, tensor in mine.items():
             tensor.copy_(state[name])
 

@@ -24,6 +24,7 @@ from codetr_ros.config import SacSettings
 from codetr_ros.learners.base import LearnerError
 from codetr_ros.memory.batches import StepBatch
 from codetr_ros.policy.actor import Actor
+from codetr_ros.system.states import check_state
 
 
 class SacError(LearnerError):
@@ -118,24 +119,10 @@ class SAC:
         """Take over what `state` returned.
 
         Raises:
-            SacError: a tensor is missing, unknown, or of another shape or type; nothing has
-            changed then.
+            SacError: it is another learner's or architecture's; nothing has changed then.
         """
         mine = self._tensors()
-        if mine.keys() != state.keys():
-            raise SacError(
-                f'SAC state: missing {sorted(mine.keys() - state.keys())}, '
-                f'unknown {sorted(state.keys() - mine.keys())}; '
-                'it was saved with other settings of sac or by another version of codetr_ros'
-            )
-        for name, tensor in state.items():
-            came = (str(tensor.dtype), tuple(tensor.shape))
-            expected = (str(mine[name].dtype), tuple(mine[name].shape))
-            if came != expected:
-                raise SacError(
-                    f'SAC state: {name} is {came}, expected {expected}; '
-                    'it was saved with other settings of sac or for another task'
-                )
+        check_state("policy learner 'sac'", mine, state, SacError)
         for name, tensor in state.items():
             mine[name].copy_(tensor)
 

@@ -28,10 +28,8 @@ from codetr_ros.bags.reader import Message
 from codetr_ros.offline import mapping
 from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.mapping import Mapping
-from codetr_ros.records import F32, F64, CompositeReward, Transitions
+from codetr_ros.records import F32, F64, MESSAGE_BYTES, CompositeReward, Transitions
 
-CHUNK_BYTES = 200_000
-"""Size at which steps are written; an episode's last chunk says that it has ended."""
 NS = 10**9
 
 NO_OBSERVATION = 'samples without an observation within max_age'
@@ -212,7 +210,7 @@ class Converter:
     def _complete(self, observation: F64) -> Iterator[Timed]:
         """The next observation of the pending step is known."""
         assert self._pending is not None
-        room = max(1, CHUNK_BYTES // (4 * (len(observation) + len(self._pending.action))))
+        room = max(1, MESSAGE_BYTES // (4 * (len(observation) + len(self._pending.action))))
         if len(self._steps) >= room:
             yield from self._write(False, False)
         self._steps.append(self._pending)

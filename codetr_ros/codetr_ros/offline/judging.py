@@ -5,13 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from codetr_ros.config import Settings
 from codetr_ros.offline.fitting import BATCH, predictions
 from codetr_ros.offline.loading import Loaded
 from codetr_ros.records import F32, F64, I64
 from codetr_ros.rewards.base import RewardMethod
-from codetr_ros.rewards.codetr import Codetr
-from codetr_ros.rewards.ircr import Ircr
 from codetr_ros.rewards.learned import Learned
 from codetr_ros.runs.recovery_metrics import r_squared, step_recovery
 
@@ -50,19 +47,12 @@ class Judgement:
     shown: list[Shown]
 
 
-def unit(method: RewardMethod, settings: Settings) -> float:
-    """What the labels of a method are to be multiplied by to be in the unit of scores."""
-    scaled = settings.reward_unit == 'scaled' and not isinstance(method, Ircr)
-    return method.target_scale if scaled else 1.0
-
-
-def judge(method: RewardMethod, loaded: Loaded, unit: float) -> Judgement:
+def judge(method: RewardMethod, loaded: Loaded) -> Judgement:
     """Label all segments of a memory and compare what can be compared.
 
     Args:
         method: the method, prepared.
         loaded: the memory.
-        unit: by which labels are multiplied to be in the unit of scores.
 
     Returns:
         Of the metrics those that cannot be computed are None: there is no variance, or no true
@@ -71,7 +61,7 @@ def judge(method: RewardMethod, loaded: Loaded, unit: float) -> Judgement:
     memory = loaded.memory
     ids = memory.segment_ids()
     values = memory.scores(ids)
-    labels = labels_of(method, loaded, ids) * np.float32(unit)
+    labels = labels_of(method, loaded, ids) * np.float32(method.unit)
     true = true_rewards_of(loaded, ids)
     inside = ~np.isnan(labels)
     known = np.asarray((np.isfinite(true) | ~inside).all(1))
@@ -134,7 +124,7 @@ def _shown(
     for i in chosen.tolist():
         stretch, length = loaded.stretches[int(episodes[i])], int(lengths[i])
         batch = memory.segment_batch(ids[i : i + 1], method.context)
-        weights = method.components(batch)[0][0] if isinstance(method, Codetr) else None
+        weights = method.step_weights(batch)
         found.append(
             Shown(
                 stretch.key.source,
@@ -144,7 +134,7 @@ def _shown(
                 float(predicted[i]) if predicted is not None else None,
                 labels[i, :length],
                 true[i, :length] if known[i] else None,
-                weights[batch.context[0] :] if weights is not None else None,
+                None if weights is None else weights[0, batch.context[0] :],
             )
         )
     return found

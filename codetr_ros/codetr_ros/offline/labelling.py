@@ -21,11 +21,10 @@ from codetr_ros.bags.raw import LIBRARY, Channel, RawMessage
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.topics import BagTopic, schema_text, type_hash
 from codetr_ros.bags.unfinished import unfinished
-from codetr_ros.cores.labeller import PART_BYTES
 from codetr_ros.offline.episodes import Index, Key, Stretch, stretches
 from codetr_ros.offline.judging import labels_of
 from codetr_ros.offline.loading import load
-from codetr_ros.records import TOPICS, StepRewards
+from codetr_ros.records import MESSAGE_BYTES, TOPICS, StepRewards
 from codetr_ros.records.fields import type_name
 from codetr_ros.rewards.base import RewardMethod, RewardModelError
 from codetr_ros.rewards.saved import SavedModel, restore
@@ -132,7 +131,7 @@ def _parts(found: Sequence[Stretch]) -> dict[Key, list[list[Stretch]]]:
     for stretch in found:
         size = int(stretch.segments.lengths.sum()) * 4 + len(stretch.segments.lengths) * 12
         mine = parts.setdefault(stretch.key, [])
-        if not mine or sizes[stretch.key] + size > PART_BYTES:
+        if not mine or sizes[stretch.key] + size > MESSAGE_BYTES:
             mine.append([])
             sizes[stretch.key] = 0
         mine[-1].append(stretch)

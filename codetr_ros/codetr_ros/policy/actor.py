@@ -66,7 +66,7 @@ class Actor(nn.Module):
     def __init__(self, observation_size: int, action_size: int, hidden: Sequence[int]) -> None:
         super().__init__()
         self.action_size = action_size
-        self.body = _body(observation_size, hidden, nn.ReLU)
+        self.body = layers(observation_size, hidden, nn.ReLU)
         self.heads = nn.Linear(hidden[-1], 2 * action_size)
         for layer in linear_layers(self):
             nn.init.zeros_(layer.bias)
@@ -97,7 +97,7 @@ class StandardisedActor(nn.Module):
 
     def __init__(self, observation_size: int, action_size: int, hidden: Sequence[int]) -> None:
         super().__init__()
-        self.body = _body(observation_size, hidden, nn.Tanh)
+        self.body = layers(observation_size, hidden, nn.Tanh)
         self.mean = nn.Linear(hidden[-1], action_size)
         self.log_std = nn.Parameter(torch.zeros(action_size))
         self.register_buffer('observation_mean', torch.zeros(observation_size))
@@ -117,7 +117,8 @@ KINDS: dict[str, type[Actor | StandardisedActor]] = {
 """Policy networks by the name that a description gives them."""
 
 
-def _body(inputs: int, hidden: Sequence[int], activation: type[nn.Module]) -> nn.Sequential:
+def layers(inputs: int, hidden: Sequence[int], activation: type[nn.Module]) -> nn.Sequential:
+    """The hidden layers of a network, each followed by its activation."""
     body = nn.Sequential()
     for width, following in pairwise([inputs, *hidden]):
         body.extend([nn.Linear(width, following), activation()])

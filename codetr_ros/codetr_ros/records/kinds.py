@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 PROTOCOL_VERSION = 1
 """Raised whenever a field changes its meaning; nodes of different versions refuse each other."""
 
+MESSAGE_BYTES = 200_000
+"""Most bytes of a message's arrays: the middleware's shared-memory segment holds 512 KB."""
+
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 U32 = NDArray[np.uint32]

@@ -13,6 +13,7 @@ from codetr_ros.config import Settings
 from codetr_ros.memory.batches import SegmentBatch
 from codetr_ros.memory.trajectories import Trajectories, measure_scale
 from codetr_ros.records import F32
+from codetr_ros.system.states import check_state
 
 
 class RewardModelError(ValueError):
@@ -73,6 +74,11 @@ class RewardMethod(ABC):
         """A number that rises whenever labels given before may have changed."""
         return self.gradient_steps
 
+    @property
+    def unit(self) -> float:
+        """What labels are multiplied by to be in the task's unit."""
+        return self.target_scale if self._settings.reward_unit == 'scaled' else 1.0
+
     def prepare(self, memory: Trajectories) -> None:
         """See the memory before a phase's gradient steps and labels.
 
@@ -127,6 +133,10 @@ class RewardMethod(ABC):
         """
         raise NotImplementedError(f'method {self.name!r} labels whole segments')
 
+    def step_weights(self, batch: SegmentBatch) -> F32 | None:
+        """Weights w (B, L) by which the steps count for the score, where a method has such."""
+        return None
+
     def state(self) -> dict[str, torch.Tensor]:
         """Everything that it takes to go on from here, in copies."""
         return {'target_scale': torch.tensor(self.target_scale, dtype=torch.float64)}
@@ -137,7 +147,7 @@ class RewardMethod(ABC):
         Raises:
             RewardModelError: it is another method's or architecture's; nothing has changed then.
         """
-        check_state(self.name, self.state(), state)
+        check_state(f'reward method {self.name!r}', self.state(), state, RewardModelError)
         self.target_scale = float(state['target_scale'])
 
     def _require_prepared(self) -> None:
@@ -147,48 +157,9 @@ class RewardMethod(ABC):
                 'call prepare(memory) before it is trained or asked'
             )
 
-    @property
-    def _unit(self) -> float:
-        """What labels are in units of, in the task's unit."""
-        return self.target_scale if self._settings.reward_unit == 'scaled' else 1.0
-
 
 def segment_steps(batch: SegmentBatch) -> NDArray[np.bool_]:
     """Which steps (B, L) of a batch are its segments' own: neither context nor padding."""
     step = np.arange(batch.actions.shape[1])
     inside: NDArray[np.bool_] = (step >= batch.context[:, None]) & (step < batch.lengths[:, None])
     return inside
-
-
-def check_state(
-    method: str, expected: Mapping[str, torch.Tensor], given: Mapping[str, torch.Tensor]
-) -> None:
-    """Refuse a state that is not one of this very method and architecture.
-
-    Args:
-        method: whose state is expected, for the error.
-        expected: a state of it, for names, shapes and types.
-        given: the state to be loaded.
-
-    Raises:
-        RewardModelError: a tensor is missing, unknown, of another shape or type, or not finite.
-    """
-    wrong = [f'{name} is missing' for name in expected if name not in given]
-    wrong += [f'{name} is unknown' for name in given if name not in expected]
-    for name, tensor in given.items():
-        if name not in expected:
-            continue
-        want = expected[name]
-        if (tensor.shape, tensor.dtype) != (want.shape, want.dtype):
-            wrong.append(
-                f'{name} is {tuple(tensor.shape)} {tensor.dtype}, '
-                f'expected {tuple(want.shape)} {want.dtype}'
-            )
-        elif tensor.is_floating_point() and not bool(tensor.isfinite().all()):
-            wrong.append(f'{name} has values that are not finite')
-    if wrong:
-        more = f' and {len(wrong) - 5} more' if len(wrong) > 5 else ''
-        raise RewardModelError(
-            f'state of reward method {method!r} refused: {"; ".join(wrong[:5])}{more}. '
-            f'It belongs to other settings or another task: use those it was saved with'
-        )

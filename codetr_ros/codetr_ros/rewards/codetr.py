@@ -62,6 +62,10 @@ class Codetr(SequenceMethod):
         rhat[outside] = 0
         return w, rhat
 
+    def step_weights(self, batch: SegmentBatch) -> F32:
+        """Weights w (B, L), 1 on average over a segment's steps."""
+        return self.components(batch)[0]
+
     def predict(self, batch: SegmentBatch) -> F64:
         """The predicted composite rewards R_hat (B,), in the task's unit, whatever the label."""
         weights, rewards = self.components(batch)

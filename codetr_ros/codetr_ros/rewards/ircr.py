@@ -51,6 +51,11 @@ class Ircr(RewardMethod):
         """Phases in which an extreme has moved."""
         return self._moves
 
+    @property
+    def unit(self) -> float:
+        """1: labels have no unit."""
+        return 1.0
+
     def prepare(self, memory: Trajectories) -> None:
         """Look at the scores that the memory holds: the extremes may move, and the labels too."""
         super().prepare(memory)

@@ -24,7 +24,7 @@ class Redistribution(RewardMethod):
             RewardModelError: `prepare` was never called.
         """
         self._require_prepared()
-        return (self._rule(batch, self._unit) * segment_steps(batch)).astype(np.float32)
+        return (self._rule(batch, self.unit) * segment_steps(batch)).astype(np.float32)
 
     @abstractmethod
     def _rule(self, batch: SegmentBatch, unit: float) -> F32 | F64:

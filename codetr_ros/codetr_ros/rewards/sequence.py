@@ -19,11 +19,11 @@ from codetr_ros.rewards.base import RewardModelError, segment_steps
 from codetr_ros.rewards.learned import Learned
 from codetr_ros.system import freed_memory
 
-PART_BYTES = 16 << 20
+ARRAY_BYTES = 16 << 20
 """Upper bound of one window's or several windows' activations of one kind, where more than one
 window is looked at: half of what the C library serves from memory that it has (`freed_memory`).
 """
-DEVICE_PART_BYTES = 1 << 30
+DEVICE_ARRAY_BYTES = 1 << 30
 """The same on another device than the CPU, which wants much to do at a time (not measured)."""
 PART_WINDOWS = 65_535
 """Most windows at a time: so many sequences CUDA's kernels for attention take."""
@@ -104,7 +104,7 @@ class SequenceMethod(Learned):
         return labels[np.arange(len(labels)), batch.lengths - 1]
 
     def _parts(self, batch: SegmentBatch) -> list[SegmentBatch]:
-        """The batch in parts of equal size, none of which makes larger arrays than `PART_BYTES`.
+        """The batch in parts of equal size, none of which makes larger arrays than `ARRAY_BYTES`.
 
         They stay in the processor's cache, and their memory is used again.
         """
@@ -114,7 +114,7 @@ class SequenceMethod(Learned):
 
     def _part_count(self, windows: int, steps: int) -> int:
         """Into how many parts windows of so many steps are cut."""
-        most = PART_BYTES if self.device.type == 'cpu' else DEVICE_PART_BYTES
+        most = ARRAY_BYTES if self.device.type == 'cpu' else DEVICE_ARRAY_BYTES
         tokens = steps * (2 if self._codetr.tokens == 'pair' else 1)
         widest = max(4 * self._codetr.embedding, self._codetr.heads * tokens) * tokens * 4
         return -(-windows // min(PART_WINDOWS, max(1, most // widest)))

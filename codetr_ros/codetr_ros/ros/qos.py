@@ -29,11 +29,12 @@ from math import ceil
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from codetr_ros.config import Settings
+from codetr_ros.records import MESSAGE_BYTES
 
 FLOOR = 16
 MARGIN = 1.25
-PART_BYTES = 100_000
-"""Half of what fills a part of step rewards: the other half may be left empty."""
+HALF_A_PART = MESSAGE_BYTES // 2
+"""Bytes of a part of step rewards that are filled in any case."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,8 @@ QUALITIES: dict[str, Quality] = {
     'composite_rewards': Quality(False, _steps),
     'commits': Quality(True, _phases),
     'step_rewards': Quality(
-        False, lambda s: _phases(s) * (s.source_count + ceil(16 * s.memory_steps / PART_BYTES))
+        False,
+        lambda s: _phases(s) * (s.source_count + ceil(16 * s.memory_steps / HALF_A_PART)),
     ),
     'episodes': Quality(False, lambda s: _steps(s) + s.evaluate_episodes),
     'true_rewards': Quality(False, _steps),

@@ -9,6 +9,7 @@ from codetr_ros.config import Settings
 from codetr_ros.policy.acting import ActingPolicy, uniform_actions
 from codetr_ros.records import (
     F32,
+    MESSAGE_BYTES,
     PROTOCOL_VERSION,
     CompositeReward,
     Policy,
@@ -22,15 +23,13 @@ from codetr_ros.seeding import generator
 from codetr_ros.simulation.episode import Episode, Score
 from codetr_ros.simulation.tasks import TaskError, make, r_max
 
-CHUNK_BYTES = 200_000
-"""Most bytes of a chunk: the middleware's shared-memory segment holds 512 KB."""
 CHUNK_STEPS = 250
 """Most steps of a chunk: bounds how long an environment's part of a slice of work takes."""
 
 
 def chunk_steps(observation_size: int, action_size: int) -> int:
     """Most steps T of a chunk, so that (T+1, O) and (T, A) float32 fit; 0 if no step does."""
-    numbers = CHUNK_BYTES // 4
+    numbers = MESSAGE_BYTES // 4
     fitting = (numbers - observation_size) // (observation_size + action_size)
     return max(0, min(CHUNK_STEPS, fitting))
 
@@ -63,7 +62,7 @@ class Source:
         if not self._chunk_steps:
             raise TaskError(
                 f'task {settings.task!r}: one step with {sizes[0]} observations and {sizes[1]} '
-                f'actions takes more than the {CHUNK_BYTES} bytes of a message: choose a task '
+                f'actions takes more than the {MESSAGE_BYTES} bytes of a message: choose a task '
                 'with smaller observations'
             )
         self._episodes = -1  # the number of the one that runs
