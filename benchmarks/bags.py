@@ -84,7 +84,15 @@ def a_run(steps: int, observations: int) -> Iterator[list[Record]]:
     rng = np.random.default_rng(0)
     settings = settings_of(steps)
     task = TaskSpec(
-        'run', PROTOCOL_VERSION, 'sim', 'Ant-v5', observations, ACTIONS, PHASE, 0.05, 1.0
+        run_id='run',
+        protocol_version=PROTOCOL_VERSION,
+        source='sim',
+        task='Ant-v5',
+        observation_size=observations,
+        action_size=ACTIONS,
+        horizon=PHASE,
+        control_period=0.05,
+        r_max=1.0,
     )
     opening: list[Record] = [settings.run_spec('run'), task]
     score = 0
@@ -94,26 +102,79 @@ def a_run(steps: int, observations: int) -> Iterator[list[Record]]:
         for half in range(PHASE // CHUNK):
             first = half * CHUNK
             last = first + CHUNK == PHASE
-            place = PHASE // CHUNK * phase + half, phase, phase, first
             actions = rng.uniform(-1, 1, (CHUNK, ACTIONS)).astype(np.float32)
             seen = drawn[first : first + CHUNK + 1]
             due = PHASE // DELAY * last
             records += [
-                Transitions('run', 'sim', *place, CHUNK, seen, actions, False, last, last, due),
-                TrueRewards('run', 'sim', *place, rng.normal(size=CHUNK).astype(np.float32)),
+                Transitions(
+                    run_id='run',
+                    source='sim',
+                    sequence=PHASE // CHUNK * phase + half,
+                    phase=phase,
+                    episode=phase,
+                    first_step=first,
+                    steps=CHUNK,
+                    observations=seen,
+                    actions=actions,
+                    terminated=False,
+                    truncated=last,
+                    phase_end=last,
+                    scores_due=due,
+                ),
+                TrueRewards(
+                    run_id='run',
+                    source='sim',
+                    sequence=PHASE // CHUNK * phase + half,
+                    phase=phase,
+                    episode=phase,
+                    first_step=first,
+                    rewards=rng.normal(size=CHUNK).astype(np.float32),
+                ),
             ]
             for start in range(first, first + CHUNK, DELAY):
                 value = float(rng.normal())
                 records.append(
-                    CompositeReward('run', 'sim', 'sim', score, phase, start, DELAY, value)
+                    CompositeReward(
+                        run_id='run',
+                        source='sim',
+                        scorer='sim',
+                        sequence=score,
+                        episode=phase,
+                        first_step=start,
+                        length=DELAY,
+                        value=value,
+                    )
                 )
                 score += 1
         ends = np.array([PHASE // CHUNK * (phase + 1) - 1]), np.array([score - 1])
-        records.append(Commit('run', phase, ('sim',), ends[0], ('sim',), ends[1], ()))
+        records.append(
+            Commit(
+                run_id='run',
+                phase=phase,
+                sources=('sim',),
+                transitions=ends[0],
+                scorers=('sim',),
+                scores=ends[1],
+                dropped=(),
+            )
+        )
         starts = np.arange(0, PHASE, DELAY, dtype=np.uint32)
         same = np.full(len(starts), phase, np.uint32), np.full(len(starts), DELAY, np.uint32)
         labels = rng.normal(size=PHASE).astype(np.float32)
-        opening = [StepRewards('run', phase, phase, 0, 1, 'sim', same[0], starts, same[1], labels)]
+        opening = [
+            StepRewards(
+                run_id='run',
+                phase=phase,
+                version=phase,
+                part=0,
+                parts=1,
+                source='sim',
+                episodes=same[0],
+                first_steps=starts,
+                lengths=same[1],
+                labels=labels,
+            )
+        ]
         yield records
     yield opening
 

@@ -63,11 +63,37 @@ def memory(delay: int, episodes: int) -> Trajectories:
     for n in range(episodes):
         observations = rng.standard_normal((EPISODE + 1, OBSERVATION), np.float32)
         actions = rng.uniform(-1, 1, (EPISODE, ACTION)).astype(np.float32)
-        head = ('run', 'sim', n, n, n, 0, EPISODE)
-        found.append(Transitions(*head, observations, actions, False, True, True, 1))
+        found.append(
+            Transitions(
+                run_id='run',
+                source='sim',
+                sequence=n,
+                phase=n,
+                episode=n,
+                first_step=0,
+                steps=EPISODE,
+                observations=observations,
+                actions=actions,
+                terminated=False,
+                truncated=True,
+                phase_end=True,
+                scores_due=1,
+            )
+        )
         for first in range(0, EPISODE, delay):
             value = float(rng.standard_normal())
-            found.score(CompositeReward('run', 'sim', 'sim', first, n, first, delay, value))
+            found.score(
+                CompositeReward(
+                    run_id='run',
+                    source='sim',
+                    scorer='sim',
+                    sequence=first,
+                    episode=n,
+                    first_step=first,
+                    length=delay,
+                    value=value,
+                )
+            )
     return found
 
 

@@ -66,18 +66,54 @@ def work(role: str, observation: int, steps: int) -> dict[str, Any]:
     for number, length in episodes(steps, rng):
         seen = rng.standard_normal((length + 1, observation), np.float32)
         actions = rng.uniform(-1, 1, (length, ACTION)).astype(np.float32)
-        head = ('run', 'sim', number, 0, number, 0, length)
-        memory.append(Transitions(*head, seen, actions, length < 1000, length == 1000, False, 0))
+        memory.append(
+            Transitions(
+                run_id='run',
+                source='sim',
+                sequence=number,
+                phase=0,
+                episode=number,
+                first_step=0,
+                steps=length,
+                observations=seen,
+                actions=actions,
+                terminated=length < 1000,
+                truncated=length == 1000,
+                phase_end=False,
+                scores_due=0,
+            )
+        )
         firsts = np.arange(0, length, DELAY)
         lengths = np.minimum(DELAY, length - firsts)
         if role == 'reward':
             for first, size in zip(firsts.tolist(), lengths.tolist(), strict=True):
-                memory.score(CompositeReward('run', 'sim', 'sim', 0, number, first, size, 1.0))
+                memory.score(
+                    CompositeReward(
+                        run_id='run',
+                        source='sim',
+                        scorer='sim',
+                        sequence=0,
+                        episode=number,
+                        first_step=first,
+                        length=size,
+                        value=1.0,
+                    )
+                )
         else:
-            where = [column.astype(np.uint32) for column in (np.full_like(firsts, number), firsts)]
             labels = np.zeros(length, np.float32)
             memory.apply(
-                StepRewards('run', 0, 1, 0, 1, 'sim', *where, lengths.astype(np.uint32), labels)
+                StepRewards(
+                    run_id='run',
+                    phase=0,
+                    version=1,
+                    part=0,
+                    parts=1,
+                    source='sim',
+                    episodes=np.full(len(firsts), number, np.uint32),
+                    first_steps=firsts.astype(np.uint32),
+                    lengths=lengths.astype(np.uint32),
+                    labels=labels,
+                )
             )
     filled = peak()
     if role == 'reward':

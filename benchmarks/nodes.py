@@ -120,12 +120,37 @@ def a_phase(phase: int) -> list[Record]:
         last = first + steps == PHASE
         seen = rng.standard_normal((steps + 1, OBSERVATIONS), dtype=np.float32)
         actions = rng.random((steps, ACTIONS), dtype=np.float32)
-        place = sequence, phase, phase, first
         due = PHASE // DELAY if last else 0
-        ends = False, last, last
-        records.append(Transitions('run', 'sim', *place, steps, seen, actions, *ends, due))
+        records.append(
+            Transitions(
+                run_id='run',
+                source='sim',
+                sequence=sequence,
+                phase=phase,
+                episode=phase,
+                first_step=first,
+                steps=steps,
+                observations=seen,
+                actions=actions,
+                terminated=False,
+                truncated=last,
+                phase_end=last,
+                scores_due=due,
+            )
+        )
     for i in range(PHASE // DELAY):
-        records.append(CompositeReward('run', 'sim', 'sim', i, phase, DELAY * i, DELAY, 1.0))
+        records.append(
+            CompositeReward(
+                run_id='run',
+                source='sim',
+                scorer='sim',
+                sequence=i,
+                episode=phase,
+                first_step=DELAY * i,
+                length=DELAY,
+                value=1.0,
+            )
+        )
     return records
 
 

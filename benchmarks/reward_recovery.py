@@ -128,27 +128,48 @@ def memories(data: dict[str, np.ndarray], settings: Settings) -> tuple[Trajector
         n = len(rows)
         memory.append(
             Transitions(
-                '',
-                's',
-                number,
-                0,
-                number,
-                0,
-                n,
-                observations,
-                data['actions'][rows],
-                False,
-                True,
-                False,
-                0,
+                run_id='',
+                source='s',
+                sequence=number,
+                phase=0,
+                episode=number,
+                first_step=0,
+                steps=n,
+                observations=observations,
+                actions=data['actions'][rows],
+                terminated=False,
+                truncated=True,
+                phase_end=False,
+                scores_due=0,
             )
         )
         true = data['rewards'][rows]
-        memory.append_true_rewards(TrueRewards('', 's', number, 0, number, 0, true))
+        memory.append_true_rewards(
+            TrueRewards(
+                run_id='',
+                source='s',
+                sequence=number,
+                phase=0,
+                episode=number,
+                first_step=0,
+                rewards=true,
+            )
+        )
         for first in range(0, n, DELAY):
             part = true[first : first + DELAY].astype(np.float64)
             value = composite(settings.composite, part, settings.beta, DELAY)
-            memory.score(CompositeReward('', 's', 's', 0, number, first, len(part), value))
+            memory.score(
+                CompositeReward(
+                    run_id='',
+                    source='s',
+                    scorer='s',
+                    sequence=0,
+                    episode=number,
+                    first_step=first,
+                    length=len(part),
+                    value=value,
+                )
+            )
     return made[0], made[1]
 
 

@@ -62,8 +62,23 @@ class Run:
         O, A = self._sizes  # noqa: E741, N806
         observations = self._rng.standard_normal((EPISODE + 1, O), np.float32)
         actions = self._rng.uniform(-1, 1, (EPISODE, A)).astype(np.float32)
-        head = ('run', 'sim', self._episode, 0, self._episode, 0, EPISODE)
-        self.memory.append(Transitions(*head, observations, actions, False, True, True, 0))
+        self.memory.append(
+            Transitions(
+                run_id='run',
+                source='sim',
+                sequence=self._episode,
+                phase=0,
+                episode=self._episode,
+                first_step=0,
+                steps=EPISODE,
+                observations=observations,
+                actions=actions,
+                terminated=False,
+                truncated=True,
+                phase_end=True,
+                scores_due=0,
+            )
+        )
         self.memory.evict()
         self._episode += 1
 
@@ -73,8 +88,20 @@ class Run:
         numbers = np.arange(first, self._episode, dtype=np.uint32)
         lengths = np.full(len(numbers), EPISODE, np.uint32)
         labels = self._rng.standard_normal(self.memory.steps, np.float32)
-        segments = (numbers, np.zeros_like(numbers), lengths)
-        self.memory.apply(StepRewards('run', 0, 0, 0, 1, 'sim', *segments, labels))
+        self.memory.apply(
+            StepRewards(
+                run_id='run',
+                phase=0,
+                version=0,
+                part=0,
+                parts=1,
+                source='sim',
+                episodes=numbers,
+                first_steps=np.zeros_like(numbers),
+                lengths=lengths,
+                labels=labels,
+            )
+        )
 
 
 def forms(sizes: tuple[int, int], device: str, batch: int, width: int) -> dict[str, DeviceSAC]:

@@ -108,11 +108,39 @@ def ours(form: str, size: Size) -> Callable[[int], None]:
     for n in range(STEPS // EPISODE):
         observations = rng.standard_normal((EPISODE + 1, size.observation), np.float32)
         actions = rng.uniform(-1, 1, (EPISODE, size.action)).astype(np.float32)
-        head = ('run', 'sim', n, n, n, 0, EPISODE)
-        memory.append(Transitions(*head, observations, actions, False, True, True, 1))
-        segment = [np.array([number], np.uint32) for number in (n, 0, EPISODE)]
+        memory.append(
+            Transitions(
+                run_id='run',
+                source='sim',
+                sequence=n,
+                phase=n,
+                episode=n,
+                first_step=0,
+                steps=EPISODE,
+                observations=observations,
+                actions=actions,
+                terminated=False,
+                truncated=True,
+                phase_end=True,
+                scores_due=1,
+            )
+        )
+        episode, first, length = (np.array([number], np.uint32) for number in (n, 0, EPISODE))
         labels = rng.standard_normal(EPISODE, np.float32)
-        memory.apply(StepRewards('run', n, n, 0, 1, 'sim', *segment, labels))
+        memory.apply(
+            StepRewards(
+                run_id='run',
+                phase=n,
+                version=n,
+                part=0,
+                parts=1,
+                source='sim',
+                episodes=episode,
+                first_steps=first,
+                lengths=length,
+                labels=labels,
+            )
+        )
     settings = SacSettings(
         hidden=(size.width, size.width), batch=size.batch, compile=form == 'compiled'
     )

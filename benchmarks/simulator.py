@@ -253,9 +253,15 @@ def thread_rows(name: str, arguments: argparse.Namespace) -> list[dict[str, Any]
     for number in range(-1, arguments.rounds):
         phase = number + 1
         policy = Policy(
-            run.run_id, phase, INITIAL_VERSION, sources, steps, False, describe(*sizes, HIDDEN),
-            weights,
-        )  # fmt: skip
+            run_id=run.run_id,
+            phase=phase,
+            version=INITIAL_VERSION,
+            sources=sources,
+            steps=steps,
+            random=False,
+            network=describe(*sizes, HIDDEN),
+            weights=weights,
+        )
         seconds = {}
         for who in turned(list(simulators), number):
             simulators[who].receive(policy)

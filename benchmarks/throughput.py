@@ -161,18 +161,55 @@ def filled_memory(settings: Settings, environment: tasks.Environment) -> Traject
     for i in range(-(-settings.steps // horizon)):
         observations = rng.standard_normal((horizon + 1, sizes[0]), dtype=np.float32)
         actions = rng.random((horizon, sizes[1]), dtype=np.float32) * 2 - 1
-        ends = False, True, True  # not terminated, truncated, phase_end
         memory.append(
-            Transitions('', 's', i, i, i, 0, horizon, observations, actions, *ends, scores_due=0)
+            Transitions(
+                run_id='',
+                source='s',
+                sequence=i,
+                phase=i,
+                episode=i,
+                first_step=0,
+                steps=horizon,
+                observations=observations,
+                actions=actions,
+                terminated=False,
+                truncated=True,
+                phase_end=True,
+                scores_due=0,
+            )
         )
         starts = np.arange(0, horizon, delay, dtype=np.uint32)
         lengths = np.minimum(delay, horizon - starts).astype(np.uint32)
         for first, length in zip(starts.tolist(), lengths.tolist(), strict=True):
             value = float(rng.standard_normal() * length)
-            memory.score(CompositeReward('', 's', 's', 0, i, first, length, value))
+            memory.score(
+                CompositeReward(
+                    run_id='',
+                    source='s',
+                    scorer='s',
+                    sequence=0,
+                    episode=i,
+                    first_step=first,
+                    length=length,
+                    value=value,
+                )
+            )
         labels = rng.standard_normal(horizon, dtype=np.float32)
         episodes = np.full(len(starts), i, np.uint32)
-        memory.apply(StepRewards('', i, 0, 0, 1, 's', episodes, starts, lengths, labels))
+        memory.apply(
+            StepRewards(
+                run_id='',
+                phase=i,
+                version=0,
+                part=0,
+                parts=1,
+                source='s',
+                episodes=episodes,
+                first_steps=starts,
+                lengths=lengths,
+                labels=labels,
+            )
+        )
     return memory
 
 

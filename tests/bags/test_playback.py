@@ -119,7 +119,16 @@ def test_what_belongs_to_no_phase_that_is_played_is_left_out_and_counted():
 
 
 def test_the_word_that_all_is_permitted_goes_out():
-    nothing = Policy('run', 3, 2, ('sim',), np.zeros(1, np.uint32), True, '', b'')
+    nothing = Policy(
+        run_id='run',
+        phase=3,
+        version=2,
+        sources=('sim',),
+        steps=np.zeros(1, np.uint32),
+        random=True,
+        network='',
+        weights=b'',
+    )
     p = playback([*a_run(), nothing])
     p.receive(handled(2))
     assert until_it_waits(p.work())[-1] is nothing
@@ -196,7 +205,18 @@ def test_a_run_is_played_in_whatever_order_its_topics_were_recorded(first, lag):
 
 def labels(phase, part=0):
     one = np.array([0], np.uint32)
-    return StepRewards('run', phase, phase, part, 2, 'sim', one, one, one + 1, np.zeros(1, 'f4'))
+    return StepRewards(
+        run_id='run',
+        phase=phase,
+        version=phase,
+        part=part,
+        parts=2,
+        source='sim',
+        episodes=one,
+        first_steps=one,
+        lengths=one + 1,
+        labels=np.zeros(1, 'f4'),
+    )
 
 
 @pytest.mark.parametrize('late', [Transitions, CompositeReward, Commit])
@@ -288,7 +308,17 @@ def test_a_survey_says_what_run_a_bag_holds(tmp_path):
 
 def test_presence_that_another_recorder_has_recorded_is_not_played(tmp_path):
     counts = np.zeros(0, np.uint64)
-    said = Presence('run', 'sim', '/run/sim', 'an instance', '', False, (), counts, 0)
+    said = Presence(
+        run_id='run',
+        role='sim',
+        node='/run/sim',
+        instance_id='an instance',
+        settings_hash='',
+        finished=False,
+        topics=(),
+        published=counts,
+        missed=0,
+    )
     bag = Bag(ours(tmp_path / 'bag', [*a_run(), said]))
     assert not any(isinstance(item.record, Presence) for item in items(bag, 'run'))
 
@@ -333,8 +363,18 @@ def test_settings_that_this_version_does_not_know_are_refused(tmp_path):
 
 
 def test_labels_are_played_where_their_node_is():
+    none = np.zeros(0, np.uint32)
     labels = StepRewards(
-        'run', 1, 0, 0, 1, '', *(np.zeros(0, np.uint32),) * 3, np.zeros(0, np.float32)
+        run_id='run',
+        phase=1,
+        version=0,
+        part=0,
+        parts=1,
+        source='',
+        episodes=none,
+        first_steps=none,
+        lengths=none,
+        labels=np.zeros(0, np.float32),
     )
     p = playback([*a_run(phases=2), labels], phases=1)
     p.receive(handled(0))

@@ -137,9 +137,20 @@ def test_arrays_are_writeable_memory_of_our_own(tmp_path):
 def test_a_bag_is_read_in_the_memory_of_a_chunk(tmp_path):
     steps = 2000
     chunk = Transitions(
-        'run', 'sim', 0, 0, 0, 0, steps, np.zeros((steps + 1, 100), np.float32),
-        np.zeros((steps, 1), np.float32), False, False, False, 0,
-    )  # fmt: skip
+        run_id='run',
+        source='sim',
+        sequence=0,
+        phase=0,
+        episode=0,
+        first_step=0,
+        steps=steps,
+        observations=np.zeros((steps + 1, 100), np.float32),
+        actions=np.zeros((steps, 1), np.float32),
+        terminated=False,
+        truncated=False,
+        phase_end=False,
+        scores_due=0,
+    )
     bag = ours(tmp_path / 'bag', [chunk] * 40)
     assert sum(path.stat().st_size for path in bag.iterdir()) > 30e6
     next(Bag(bag).entries())  # what is kept for good: definitions

@@ -73,11 +73,40 @@ CHUNK, SCORE, TRUE = (
     [r for r in RUN if isinstance(r, k)][3] for k in (Transitions, CompositeReward, TrueRewards)
 )
 LABELS = StepRewards(
-    'run', 0, 5, 0, 1, 'sim',
-    *(np.array([n], np.uint32) for n in (0, 0, 5)), np.ones(5, np.float32),
-)  # fmt: skip
-RESULT = EpisodeResult('run', 'sim', 'evaluation', 1, 0, 0, 5, 1.0, 1.0, float('inf'), False)
-POLICY = Policy('run', 1, 0, ('sim',), np.ones(1, np.uint32), False, '{}', b'no tensors')
+    run_id='run',
+    phase=0,
+    version=5,
+    part=0,
+    parts=1,
+    source='sim',
+    episodes=np.array([0], np.uint32),
+    first_steps=np.array([0], np.uint32),
+    lengths=np.array([5], np.uint32),
+    labels=np.ones(5, np.float32),
+)
+RESULT = EpisodeResult(
+    run_id='run',
+    source='sim',
+    purpose='evaluation',
+    step=1,
+    version=0,
+    episode=0,
+    length=5,
+    true_return=1.0,
+    composite_return=1.0,
+    score=float('inf'),
+    terminated=False,
+)
+POLICY = Policy(
+    run_id='run',
+    phase=1,
+    version=0,
+    sources=('sim',),
+    steps=np.ones(1, np.uint32),
+    random=False,
+    network='{}',
+    weights=b'no tensors',
+)
 
 FAULTS = {
     'a chunk is missing': (

@@ -221,7 +221,18 @@ def evaluated(settings: config.Settings) -> list[EpisodeResult]:
     """The random policy's evaluation, as a run has it."""
     evaluator = Evaluator(settings.run_spec('run'), settings, 'evaluate')
     none = np.zeros(1, np.uint32)
-    evaluator.receive(Policy('run', 0, -1, ('sim',), none, True, '', b''))
+    evaluator.receive(
+        Policy(
+            run_id='run',
+            phase=0,
+            version=-1,
+            sources=('sim',),
+            steps=none,
+            random=True,
+            network='',
+            weights=b'',
+        )
+    )
     found: list[EpisodeResult] = []
     for records in evaluator.work():
         if records is None:

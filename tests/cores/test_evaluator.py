@@ -169,7 +169,22 @@ def test_without_evaluations_it_has_finished_when_the_last_version_arrives():
         (permit(2, network=describe(5, 1, (16,))), 'another architecture'),
         (permit(2, weights=b''), 'are not safetensors'),
         (permit(2, version=6), 'version=6.*version -1 to 5'),
-        (EpisodeResult('run', 'a', 'random', 0, -1, 0, 1, 0.0, 0.0, 0.0, True), 'policies only'),
+        (
+            EpisodeResult(
+                run_id='run',
+                source='a',
+                purpose='random',
+                step=0,
+                version=-1,
+                episode=0,
+                length=1,
+                true_return=0.0,
+                composite_return=0.0,
+                score=0.0,
+                terminated=True,
+            ),
+            'policies only',
+        ),
     ],
 )
 def test_a_policy_that_cannot_be_evaluated_is_refused_and_changes_nothing(wrong, message, whole):

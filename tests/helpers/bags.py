@@ -38,22 +38,58 @@ def a_run(phases: int = 3, seed: int = 0, run_id: str = 'run', chunk: int = 5) -
             observations = np.vstack([last[None], rng.normal(size=(chunk, 3))]).astype(np.float32)
             last = observations[-1]
             done = step + chunk == EPISODE
-            place = sequence, phase, episode, step
             actions = rng.uniform(-1, 1, (chunk, 2)).astype(np.float32)
             end = taken == 20
             records += [
                 Transitions(
-                    run_id, 'sim', *place, chunk, observations, actions, False, done, end, 4 * end
+                    run_id=run_id,
+                    source='sim',
+                    sequence=sequence,
+                    phase=phase,
+                    episode=episode,
+                    first_step=step,
+                    steps=chunk,
+                    observations=observations,
+                    actions=actions,
+                    terminated=False,
+                    truncated=done,
+                    phase_end=end,
+                    scores_due=4 * end,
                 ),
-                TrueRewards(run_id, 'sim', *place, rng.normal(size=chunk).astype(np.float32)),
+                TrueRewards(
+                    run_id=run_id,
+                    source='sim',
+                    sequence=sequence,
+                    phase=phase,
+                    episode=episode,
+                    first_step=step,
+                    rewards=rng.normal(size=chunk).astype(np.float32),
+                ),
                 CompositeReward(
-                    run_id, 'sim', 'sim', scored, episode, step, chunk, float(rng.normal())
+                    run_id=run_id,
+                    source='sim',
+                    scorer='sim',
+                    sequence=scored,
+                    episode=episode,
+                    first_step=step,
+                    length=chunk,
+                    value=float(rng.normal()),
                 ),
             ]
             sequence, scored = sequence + 1, scored + 1
             episode, step = (episode + 1, 0) if done else (episode, step + chunk)
         ends = [np.array([n - 1], np.int64) for n in (sequence, scored)]
-        records.append(Commit(run_id, phase, ('sim',), ends[0], ('sim',), ends[1], ()))
+        records.append(
+            Commit(
+                run_id=run_id,
+                phase=phase,
+                sources=('sim',),
+                transitions=ends[0],
+                scorers=('sim',),
+                scores=ends[1],
+                dropped=(),
+            )
+        )
         records.append(metrics(run_id, 'sim', 'sim', phase, 20 * (phase + 1), {'x': 0.5}))
     return records
 

@@ -60,7 +60,17 @@ def run(settings: Settings | None = None, run_id: str = 'run') -> RunSpec:
 
 
 def task_spec(**changes: Any) -> TaskSpec:
-    spec = TaskSpec('run', PROTOCOL_VERSION, 'sim', 'a task', OBSERVATION, ACTION, 1000, 0.05, 1.0)
+    spec = TaskSpec(
+        run_id='run',
+        protocol_version=PROTOCOL_VERSION,
+        source='sim',
+        task='a task',
+        observation_size=OBSERVATION,
+        action_size=ACTION,
+        horizon=1000,
+        control_period=0.05,
+        r_max=1.0,
+    )
     return replace(spec, **changes)
 
 
@@ -69,43 +79,88 @@ def transitions(**changes: Any) -> Transitions:
     steps = changes.get('steps', 5)
     rng = np.random.default_rng(0)
     chunk = Transitions(
-        'run',
-        'sim',
-        0,
-        0,
-        0,
-        0,
-        steps,
-        rng.normal(size=(steps + 1, OBSERVATION)).astype(np.float32),
-        rng.uniform(-1, 1, (steps, ACTION)).astype(np.float32),
-        False,
-        False,
-        False,
-        0,
+        run_id='run',
+        source='sim',
+        sequence=0,
+        phase=0,
+        episode=0,
+        first_step=0,
+        steps=steps,
+        observations=rng.normal(size=(steps + 1, OBSERVATION)).astype(np.float32),
+        actions=rng.uniform(-1, 1, (steps, ACTION)).astype(np.float32),
+        terminated=False,
+        truncated=False,
+        phase_end=False,
+        scores_due=0,
     )
     return replace(chunk, **changes)
 
 
 def score(**changes: Any) -> CompositeReward:
-    return replace(CompositeReward('run', 'sim', 'sim', 0, 0, 0, 7, 1.5), **changes)
+    return replace(
+        CompositeReward(
+            run_id='run',
+            source='sim',
+            scorer='sim',
+            sequence=0,
+            episode=0,
+            first_step=0,
+            length=7,
+            value=1.5,
+        ),
+        **changes,
+    )
 
 
 def commit(**changes: Any) -> Commit:
     last = np.zeros(1, np.int64)
-    return replace(Commit('run', 0, ('sim',), last, ('sim',), last - 1, ()), **changes)
+    return replace(
+        Commit(
+            run_id='run',
+            phase=0,
+            sources=('sim',),
+            transitions=last,
+            scorers=('sim',),
+            scores=last - 1,
+            dropped=(),
+        ),
+        **changes,
+    )
 
 
 def policy(**changes: Any) -> Policy:
     """Permission for phase 0: 200 random steps of 'sim'."""
     return replace(
-        Policy('run', 0, -1, ('sim',), np.array([200], np.uint32), True, '', b''), **changes
+        Policy(
+            run_id='run',
+            phase=0,
+            version=-1,
+            sources=('sim',),
+            steps=np.array([200], np.uint32),
+            random=True,
+            network='',
+            weights=b'',
+        ),
+        **changes,
     )
 
 
 def step_rewards(**changes: Any) -> StepRewards:
-    segment = [np.array([n], np.uint32) for n in (0, 0, 5)]
+    episode, first, length = (np.array([n], np.uint32) for n in (0, 0, 5))
     return replace(
-        StepRewards('run', 0, 1, 0, 1, 'sim', *segment, np.arange(5, dtype=np.float32)), **changes
+        StepRewards(
+            run_id='run',
+            phase=0,
+            version=1,
+            part=0,
+            parts=1,
+            source='sim',
+            episodes=episode,
+            first_steps=first,
+            lengths=length,
+            labels=np.arange(5, dtype=np.float32),
+        ),
+        **changes,
     )
 
 

@@ -28,18 +28,44 @@ class Run:
         observations = self.rng.standard_normal((count + 1, OBSERVATION)).astype(np.float32)
         observations[0] = observation
         actions = self.rng.uniform(-1, 1, (count, ACTION)).astype(np.float32)
-        ended = end == 'terminated', end == 'truncated'
-        head = ('run', source, 0, 0, number, step, count)
-        self.memory.append(Transitions(*head, observations, actions, *ended, False, 0))
+        self.memory.append(
+            Transitions(
+                run_id='run',
+                source=source,
+                sequence=0,
+                phase=0,
+                episode=number,
+                first_step=step,
+                steps=count,
+                observations=observations,
+                actions=actions,
+                terminated=end == 'terminated',
+                truncated=end == 'truncated',
+                phase_end=False,
+                scores_due=0,
+            )
+        )
         self._next[source] = (
             (number + 1, 0, first) if end else (number, step + count, observations[-1])
         )
 
     def label(self, source: str, number: int, first: int, length: int) -> None:
         """New labels for steps of an episode."""
-        segment = [np.array([n], np.uint32) for n in (number, first, length)]
         labels = self.rng.standard_normal(length).astype(np.float32)
-        self.memory.apply(StepRewards('run', 0, 0, 0, 1, source, *segment, labels))
+        self.memory.apply(
+            StepRewards(
+                run_id='run',
+                phase=0,
+                version=0,
+                part=0,
+                parts=1,
+                source=source,
+                episodes=np.array([number], np.uint32),
+                first_steps=np.array([first], np.uint32),
+                lengths=np.array([length], np.uint32),
+                labels=labels,
+            )
+        )
 
     def filled(self, episodes: int = 6, length: int = 20) -> Trajectories:
         """The memory with some labelled episodes, every other one terminated."""

@@ -44,7 +44,14 @@ def memory(lengths: Sequence[int] = (64,) * 8, delay: int = DELAY, seed: int = 0
             part = rewards[first : first + delay]
             found.score(
                 CompositeReward(
-                    'run', 'sim', 'sim', first, episode, first, len(part), float(part.sum())
+                    run_id='run',
+                    source='sim',
+                    scorer='sim',
+                    sequence=first,
+                    episode=episode,
+                    first_step=first,
+                    length=len(part),
+                    value=float(part.sum()),
                 )
             )
     return found

@@ -75,11 +75,17 @@ class Play:
             counts = [link.published[t] + self.claimed.get(t, 0) for t in topics]
             link.publish(
                 Presence(
-                    self.spec.run_id, role, link.full_name, f'{role} of the test',
-                    self.spec.settings_hash,
-                    self.finished, topics, np.array(counts, np.uint64), 0,
+                    run_id=self.spec.run_id,
+                    role=role,
+                    node=link.full_name,
+                    instance_id=f'{role} of the test',
+                    settings_hash=self.spec.settings_hash,
+                    finished=self.finished,
+                    topics=topics,
+                    published=np.array(counts, np.uint64),
+                    missed=0,
                 )
-            )  # fmt: skip
+            )
 
     def until(self, found, node=None):
         """Spin, saying presence, until `found()` is true; returns what it returns."""

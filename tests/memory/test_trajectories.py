@@ -46,33 +46,53 @@ class Naive:
         sequence = self.sequence.get(source, 0)
         self.sequence[source] = sequence + 1
         return Transitions(
-            'run',
-            source,
-            sequence,
-            phase,
-            number,
-            first_step,
-            steps,
-            np.array(episode['observations'][first_step:]),
-            np.array(episode['actions'][first_step:]),
-            end == 'terminated',
-            end == 'truncated',
-            False,
-            0,
+            run_id='run',
+            source=source,
+            sequence=sequence,
+            phase=phase,
+            episode=number,
+            first_step=first_step,
+            steps=steps,
+            observations=np.array(episode['observations'][first_step:]),
+            actions=np.array(episode['actions'][first_step:]),
+            terminated=end == 'terminated',
+            truncated=end == 'truncated',
+            phase_end=False,
+            scores_due=0,
         )
 
 
 def score(
     source: str, episode: int, first: int, length: int, value: float = 1.0, sequence: int = 0
 ) -> CompositeReward:
-    return CompositeReward('run', source, source, sequence, episode, first, length, value)
+    return CompositeReward(
+        run_id='run',
+        source=source,
+        scorer=source,
+        sequence=sequence,
+        episode=episode,
+        first_step=first,
+        length=length,
+        value=value,
+    )
 
 
 def labels(
     source: str, segments: list[tuple[int, int, int]], values: np.ndarray, version: int = 1
 ) -> StepRewards:
     e, f, n = (np.array(column, np.uint32) for column in zip(*segments, strict=True))
-    return StepRewards('run', 0, version, 0, 1, source, e, f, n, values.astype(np.float32))
+    return StepRewards(
+        run_id='run',
+        phase=0,
+        version=version,
+        part=0,
+        parts=1,
+        source=source,
+        episodes=e,
+        first_steps=f,
+        lengths=n,
+        labels=values.astype(np.float32),
+    )
 
 
 def memory(capacity: int = 1000, margin: int = 100) -> Trajectories:
@@ -365,10 +385,25 @@ def test_a_step_of_ant_takes_at_most_a_tenth_more_than_its_own_numbers(scored, o
             count = min(length, steps - m.steps)
             if not count:
                 break
-            head = ('run', 'sim', number, 0, number, 0, count)
             seen = rng.random((count + 1, observation), np.float32)
             taken = rng.random((count, action), np.float32)
-            m.append(Transitions(*head, seen, taken, True, False, False, 0))
+            m.append(
+                Transitions(
+                    run_id='run',
+                    source='sim',
+                    sequence=number,
+                    phase=0,
+                    episode=number,
+                    first_step=0,
+                    steps=count,
+                    observations=seen,
+                    actions=taken,
+                    terminated=True,
+                    truncated=False,
+                    phase_end=False,
+                    scores_due=0,
+                )
+            )
             firsts = range(0, count, delay)
             where = [(number, first, min(delay, count - first)) for first in firsts]
             if scored:

@@ -37,7 +37,15 @@ def records(count, seed=0, size=3):
             truncated=True,
         )
         true = observations[:-1, 0]
-        yield TrueRewards('run', 'sim', episode, 0, episode, 0, true)
+        yield TrueRewards(
+            run_id='run',
+            source='sim',
+            sequence=episode,
+            phase=0,
+            episode=episode,
+            first_step=0,
+            rewards=true,
+        )
         for first in range(0, EPISODE, DELAY):
             value = float(true[first : first + DELAY].sum())
             yield score(sequence=n, episode=episode, first_step=first, value=value)

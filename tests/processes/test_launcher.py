@@ -330,9 +330,23 @@ def test_silence_is_broken_by_news_but_not_by_presence() -> None:
     now = [0.0]
     silence = Silence(lambda: now[0])
     now[0] = 30
-    silence.receive(Presence('r', 'sim', 'sim', 'i', '', False, (), (), 0))  # type: ignore[arg-type]
+    silence.receive(
+        Presence(
+            run_id='r',
+            role='sim',
+            node='sim',
+            instance_id='i',
+            settings_hash='',
+            finished=False,
+            topics=(),
+            published=(),
+            missed=0,
+        )
+    )  # type: ignore[arg-type]
     assert silence.seconds == 30
-    silence.receive(Commit('r', 0, (), (), (), (), ()))  # type: ignore[arg-type]
+    silence.receive(
+        Commit(run_id='r', phase=0, sources=(), transitions=(), scorers=(), scores=(), dropped=())
+    )  # type: ignore[arg-type]
     assert silence.seconds == 0
 
 

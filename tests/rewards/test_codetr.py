@@ -60,26 +60,35 @@ def memory(lengths=(20, 15), delay=DELAY, kind='sum', seed=0) -> Trajectories:
         rewards = np.tanh(observations[:-1, 0] - 2) + actions[:, 0].astype(np.float64)
         found.append(
             Transitions(
-                'run',
-                'sim',
-                episode,
-                0,
-                episode,
-                0,
-                steps,
-                observations,
-                actions,
-                False,
-                True,
-                False,
-                0,
+                run_id='run',
+                source='sim',
+                sequence=episode,
+                phase=0,
+                episode=episode,
+                first_step=0,
+                steps=steps,
+                observations=observations,
+                actions=actions,
+                terminated=False,
+                truncated=True,
+                phase_end=False,
+                scores_due=0,
             )
         )
         for first in range(0, steps, delay):
             part = rewards[first : first + delay]
             value = composite(kind, part.astype(np.float64), 3.0, delay)
             found.score(
-                CompositeReward('run', 'sim', 'sim', first, episode, first, len(part), value)
+                CompositeReward(
+                    run_id='run',
+                    source='sim',
+                    scorer='sim',
+                    sequence=first,
+                    episode=episode,
+                    first_step=first,
+                    length=len(part),
+                    value=value,
+                )
             )
     return found
 

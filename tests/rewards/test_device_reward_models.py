@@ -29,12 +29,38 @@ def memory() -> Trajectories:
     for n in range(8):
         observations = rng.standard_normal((EPISODE + 1, OBSERVATION), np.float32)
         actions = rng.uniform(-1, 1, (EPISODE, ACTION)).astype(np.float32)
-        head = ('run', 'sim', n, n, n, 0, EPISODE)
-        found.append(Transitions(*head, observations, actions, False, True, True, 1))
+        found.append(
+            Transitions(
+                run_id='run',
+                source='sim',
+                sequence=n,
+                phase=n,
+                episode=n,
+                first_step=0,
+                steps=EPISODE,
+                observations=observations,
+                actions=actions,
+                terminated=False,
+                truncated=True,
+                phase_end=True,
+                scores_due=1,
+            )
+        )
         for first in range(0, EPISODE, DELAY):
             length = min(DELAY, EPISODE - first)
             value = float(observations[first : first + length, 0].sum())
-            found.score(CompositeReward('run', 'sim', 'sim', 0, n, first, length, value))
+            found.score(
+                CompositeReward(
+                    run_id='run',
+                    source='sim',
+                    scorer='sim',
+                    sequence=0,
+                    episode=n,
+                    first_step=first,
+                    length=length,
+                    value=value,
+                )
+            )
     return found
 
 
@@ -95,12 +121,37 @@ def test_labels_put_together_on_the_device_are_those_of_the_host(
             actions = rng.uniform(-1, 1, (EPISODE, ACTION)).astype(np.float32)
             # a source's episodes number from 0 on
             number = n if source == 'sim' else n - 4
-            head = ('run', source, number, n, number, 0, EPISODE)
-            data.append(Transitions(*head, observations, actions, False, True, True, 1))
+            data.append(
+                Transitions(
+                    run_id='run',
+                    source=source,
+                    sequence=number,
+                    phase=n,
+                    episode=number,
+                    first_step=0,
+                    steps=EPISODE,
+                    observations=observations,
+                    actions=actions,
+                    terminated=False,
+                    truncated=True,
+                    phase_end=True,
+                    scores_due=1,
+                )
+            )
             for first in range(0, EPISODE, DELAY):
                 length = min(DELAY, EPISODE - first)
-                score = ('run', source, source, 0, number, first, length, float(rng.normal()))
-                data.score(CompositeReward(*score))
+                data.score(
+                    CompositeReward(
+                        run_id='run',
+                        source=source,
+                        scorer=source,
+                        sequence=0,
+                        episode=number,
+                        first_step=first,
+                        length=length,
+                        value=float(rng.normal()),
+                    )
+                )
         data.evict()
         model.prepare(data)
         ids = data.segment_ids()

@@ -46,13 +46,28 @@ def filled(true_rewards: bool = True) -> Trajectories:
         step_rewards = rng.normal(2.0, 1.0, steps).astype(np.float32)
         if true_rewards:
             memory.append_true_rewards(
-                TrueRewards('run', 'sim', episode, 0, episode, 0, step_rewards)
+                TrueRewards(
+                    run_id='run',
+                    source='sim',
+                    sequence=episode,
+                    phase=0,
+                    episode=episode,
+                    first_step=0,
+                    rewards=step_rewards,
+                )
             )
         for first in range(0, steps, DELAY):
             part = step_rewards[first : first + DELAY]
             memory.score(
                 CompositeReward(
-                    'run', 'sim', 'sim', first, episode, first, len(part), float(part.sum())
+                    run_id='run',
+                    source='sim',
+                    scorer='sim',
+                    sequence=first,
+                    episode=episode,
+                    first_step=first,
+                    length=len(part),
+                    value=float(part.sum()),
                 )
             )
     return memory

@@ -217,7 +217,15 @@ def test_of_a_node_that_was_killed_and_started_again_only_the_newest_instance_co
     def said(instance, finished):
         published = np.array([2], np.uint64)
         return Presence(
-            'run', 'evaluate', '/r/evaluate', instance, '', finished, ('metrics',), published, 0
+            run_id='run',
+            role='evaluate',
+            node='/r/evaluate',
+            instance_id=instance,
+            settings_hash='',
+            finished=finished,
+            topics=('metrics',),
+            published=published,
+            missed=0,
         )
 
     peers.hear(said('killed', False), 1.0)

@@ -30,23 +30,99 @@ ODD = np.array(
 )  # a sign, a denormal, what is no number
 
 EXAMPLES = {
-    RunSpec: RunSpec('r', 1, 7, '{"ä": 1}', 'ab'),
+    RunSpec: RunSpec(
+        run_id='r', protocol_version=1, seed=7, settings='{"ä": 1}', settings_hash='ab'
+    ),
     Presence: Presence(
-        'r', 'sim', '/r/s', 'x', '', True, ('a', 'b'), np.array([1, 2**63], 'u8'), 2**40
+        run_id='r',
+        role='sim',
+        node='/r/s',
+        instance_id='x',
+        settings_hash='',
+        finished=True,
+        topics=('a', 'b'),
+        published=np.array([1, 2**63], 'u8'),
+        missed=2**40,
     ),
-    TaskSpec: TaskSpec('r', 1, 'sim', 'Ant-v4', 27, 8, 1000, 0.05, 0.1),
-    Policy: Policy('r', 3, -1, ('sim',), np.array([5], np.uint32), False, '{}', bytes(range(9))),
+    TaskSpec: TaskSpec(
+        run_id='r',
+        protocol_version=1,
+        source='sim',
+        task='Ant-v4',
+        observation_size=27,
+        action_size=8,
+        horizon=1000,
+        control_period=0.05,
+        r_max=0.1,
+    ),
+    Policy: Policy(
+        run_id='r',
+        phase=3,
+        version=-1,
+        sources=('sim',),
+        steps=np.array([5], np.uint32),
+        random=False,
+        network='{}',
+        weights=bytes(range(9)),
+    ),
     Transitions: transitions(sequence=2**40),
-    CompositeReward: CompositeReward('r', 'sim', 'me', 5, 6, 7, 8, 0.1),
-    Commit: Commit('r', 1, ('a', 'b'), np.array([-1, 2**40]), ('c',), np.array([4]), ('d',)),
-    StepRewards: StepRewards(
-        'r', 1, 2, 0, 1, 'sim',
-        np.array([1, 2], np.uint32), np.array([0, 7], np.uint32), np.array([2, 3], np.uint32), ODD,
+    CompositeReward: CompositeReward(
+        run_id='r',
+        source='sim',
+        scorer='me',
+        sequence=5,
+        episode=6,
+        first_step=7,
+        length=8,
+        value=0.1,
     ),
-    EpisodeResult: EpisodeResult('r', 'sim', 'random', 1, -1, 2, 3, 0.1, 0.2, 0.3, True),
-    TrueRewards: TrueRewards('r', 'sim', 1, 2, 3, 4, ODD),
-    Metrics: Metrics('r', 'reward', 'reward', 1, 2, ('x', 'y'), np.array([0.1, np.nan])),
-}  # fmt: skip
+    Commit: Commit(
+        run_id='r',
+        phase=1,
+        sources=('a', 'b'),
+        transitions=np.array([-1, 2**40]),
+        scorers=('c',),
+        scores=np.array([4]),
+        dropped=('d',),
+    ),
+    StepRewards: StepRewards(
+        run_id='r',
+        phase=1,
+        version=2,
+        part=0,
+        parts=1,
+        source='sim',
+        episodes=np.array([1, 2], np.uint32),
+        first_steps=np.array([0, 7], np.uint32),
+        lengths=np.array([2, 3], np.uint32),
+        labels=ODD,
+    ),
+    EpisodeResult: EpisodeResult(
+        run_id='r',
+        source='sim',
+        purpose='random',
+        step=1,
+        version=-1,
+        episode=2,
+        length=3,
+        true_return=0.1,
+        composite_return=0.2,
+        score=0.3,
+        terminated=True,
+    ),
+    TrueRewards: TrueRewards(
+        run_id='r', source='sim', sequence=1, phase=2, episode=3, first_step=4, rewards=ODD
+    ),
+    Metrics: Metrics(
+        run_id='r',
+        role='reward',
+        node='reward',
+        phase=1,
+        step=2,
+        names=('x', 'y'),
+        values=np.array([0.1, np.nan]),
+    ),
+}
 
 
 def there_and_back(record):

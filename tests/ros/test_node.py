@@ -11,10 +11,10 @@ from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter
 from rosbags.highlevel import AnyReader
 
-from codetr_ros.records import PROTOCOL_VERSION, Commit, RunSpec, StepRewards
+from codetr_ros.records import PROTOCOL_VERSION, Commit, RunSpec
 from codetr_ros.ros.watch import Watcher
 from codetr_ros.runs import folder as run_folder
-from helpers.builders import task_spec, transitions
+from helpers.builders import step_rewards, task_spec, transitions
 from helpers.playing import NAMESPACE, PATIENCE, everybody_matched, one_phase, output, process
 
 
@@ -24,9 +24,8 @@ def test_a_recorder_commits_a_phase_and_keeps_every_byte_of_it(play, tmp_path):
         play.until(lambda: everybody_matched(play), node)
         commit = one_phase(play)
         assert (commit.phase, list(commit.sources), list(commit.transitions)) == (0, ['sim'], [0])
-        segment = [np.array([n], np.uint32) for n in (0, 0, 5)]
         labels = np.arange(5, dtype=np.float32)
-        play.links['reward'].publish(StepRewards('run', 0, 1, 0, 1, 'sim', *segment, labels))
+        play.links['reward'].publish(step_rewards())
         play.finished = True
         play.until(lambda: node.poll() is not None)
         said = output(node)
@@ -199,7 +198,13 @@ def test_an_unknown_parameter_stops_the_node_naming_it(ros_domain):
 def test_another_protocol_version_is_refused(play):
     play = play(roles=('learner',))
     spec = play.spec
-    other = RunSpec('other', PROTOCOL_VERSION + 1, 0, spec.settings, spec.settings_hash)
+    other = RunSpec(
+        run_id='other',
+        protocol_version=PROTOCOL_VERSION + 1,
+        seed=0,
+        settings=spec.settings,
+        settings_hash=spec.settings_hash,
+    )
     play.links['learner'].publish(other)
     with process('record', 'run_id:=other', 'peer_deadline:=8.0') as node:
         play.until(lambda: node.poll() is not None)

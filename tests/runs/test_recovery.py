@@ -16,7 +16,15 @@ def true_rewards(
     episode: int, first_step: int, *rewards: float, source: str = 'sim', phase: int = 0
 ) -> TrueRewards:
     values = np.array(rewards, np.float32)
-    return TrueRewards('run', source, 0, phase, episode, first_step, values)
+    return TrueRewards(
+        run_id='run',
+        source=source,
+        sequence=0,
+        phase=phase,
+        episode=episode,
+        first_step=first_step,
+        rewards=values,
+    )
 
 
 def labels(phase: int, *segments: tuple[int, int, list[float]], **changes) -> StepRewards:

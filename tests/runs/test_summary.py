@@ -37,11 +37,31 @@ class Clock:
 
 
 def commit(phase: int) -> Commit:
-    return Commit('r', phase, ('sim',), np.array([9]), ('sim',), np.array([3]), ())
+    return Commit(
+        run_id='r',
+        phase=phase,
+        sources=('sim',),
+        transitions=np.array([9]),
+        scorers=('sim',),
+        scores=np.array([3]),
+        dropped=(),
+    )
 
 
 def episode(**changes: Any) -> EpisodeResult:
-    made = EpisodeResult('r', 'evaluate', 'evaluation', 1000, 0, 0, 40, 80.0, 60.0, 0.5, True)
+    made = EpisodeResult(
+        run_id='r',
+        source='evaluate',
+        purpose='evaluation',
+        step=1000,
+        version=0,
+        episode=0,
+        length=40,
+        true_return=80.0,
+        composite_return=60.0,
+        score=0.5,
+        terminated=True,
+    )
     return replace(made, **changes)
 
 
@@ -302,7 +322,17 @@ def test_a_summary_on_disk_is_what_was_built(tmp_path: Path) -> None:
 
 def presence(node: str, missed: int = 0) -> Presence:
     published = np.array([1], np.uint64)
-    return Presence('r', 'sim', node, 'i', '', False, ('task',), published, missed)
+    return Presence(
+        run_id='r',
+        role='sim',
+        node=node,
+        instance_id='i',
+        settings_hash='',
+        finished=False,
+        topics=('task',),
+        published=published,
+        missed=missed,
+    )
 
 
 def test_progress_shows_what_nodes_say_that_they_lack() -> None:

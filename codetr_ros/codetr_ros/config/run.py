@@ -281,7 +281,13 @@ class Settings(Group):
 
     def run_spec(self, run_id: str) -> RunSpec:
         """The record that says what run this is."""
-        return RunSpec(run_id, PROTOCOL_VERSION, self.seed, self.canonical(), self.hash())
+        return RunSpec(
+            run_id=run_id,
+            protocol_version=PROTOCOL_VERSION,
+            seed=self.seed,
+            settings=self.canonical(),
+            settings_hash=self.hash(),
+        )
 
     @property
     def simulator_names(self) -> tuple[str, ...]:

@@ -192,16 +192,16 @@ class Labeller(Consumer):
                 part = labels[at : at + steps].copy()
                 found.append(
                     StepRewards(
-                        self._run.run_id,
-                        phase,
-                        version,
-                        0,
-                        0,
-                        source,
-                        episodes,
-                        firsts,
-                        counts,
-                        part,
+                        run_id=self._run.run_id,
+                        phase=phase,
+                        version=version,
+                        part=0,
+                        parts=0,
+                        source=source,
+                        episodes=episodes,
+                        first_steps=firsts,
+                        lengths=counts,
+                        labels=part,
                     )
                 )
                 at += steps
@@ -227,21 +227,30 @@ class Labeller(Consumer):
             empty = np.empty(0, np.uint32)
             nothing = np.empty(0, np.float32)
             none = StepRewards(
-                self._run.run_id, phase, version, 0, 1, '', empty, empty, empty, nothing
+                run_id=self._run.run_id,
+                phase=phase,
+                version=version,
+                part=0,
+                parts=1,
+                source='',
+                episodes=empty,
+                first_steps=empty,
+                lengths=empty,
+                labels=nothing,
             )
             return [none]
         return [
             StepRewards(
-                self._run.run_id,
-                phase,
-                version,
-                i,
-                len(parts),
-                pieces[0].source,
-                np.concatenate([p.episodes for p in pieces]),
-                np.concatenate([p.first_steps for p in pieces]),
-                np.concatenate([p.lengths for p in pieces]),
-                np.concatenate([p.labels for p in pieces]),
+                run_id=self._run.run_id,
+                phase=phase,
+                version=version,
+                part=i,
+                parts=len(parts),
+                source=pieces[0].source,
+                episodes=np.concatenate([p.episodes for p in pieces]),
+                first_steps=np.concatenate([p.first_steps for p in pieces]),
+                lengths=np.concatenate([p.lengths for p in pieces]),
+                labels=np.concatenate([p.labels for p in pieces]),
             )
             for i, pieces in enumerate(parts)
         ]

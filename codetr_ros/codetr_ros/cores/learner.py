@@ -129,14 +129,14 @@ class Learner(Consumer):
         sources = self._intake.tasks.sources
         random = phase < settings.warmup_phases
         return Policy(
-            self._run.run_id,
-            phase,
-            version,
-            sources,
-            np.array(settings.shares_of(phase), np.uint32),
-            random,
-            '' if random else learner.network,
-            b'' if random else weights_bytes(learner.actor),
+            run_id=self._run.run_id,
+            phase=phase,
+            version=version,
+            sources=sources,
+            steps=np.array(settings.shares_of(phase), np.uint32),
+            random=random,
+            network='' if random else learner.network,
+            weights=b'' if random else weights_bytes(learner.actor),
         )
 
     def _state(self) -> dict[str, torch.Tensor]:

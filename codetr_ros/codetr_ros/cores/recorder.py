@@ -143,7 +143,13 @@ class Recorder:
         names = tuple(sorted(s for s in scorers if self._committed_scores[s]))
         scores = np.array([self._committed_scores[s] - 1 for s in names], np.int64)
         return Commit(
-            self._run.run_id, phase, tuple(members), np.array(last, np.int64), names, scores, ()
+            run_id=self._run.run_id,
+            phase=phase,
+            sources=tuple(members),
+            transitions=np.array(last, np.int64),
+            scorers=names,
+            scores=scores,
+            dropped=(),
         )
 
     def waiting_for(self) -> str:

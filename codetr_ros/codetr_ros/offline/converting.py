@@ -266,8 +266,8 @@ class Converter:
         steps, self._steps = self._steps, []
         observations = [step.observation for step in steps] + [self._last]
         chunk = Transitions(
-            self._run_id,
-            self._rules.source,
+            run_id=self._run_id,
+            source=self._rules.source,
             sequence=self._sequence,
             phase=0,
             episode=self._episode,
@@ -319,8 +319,8 @@ class Converter:
                     continue
             yield (
                 CompositeReward(
-                    self._run_id,
-                    self._rules.source,
+                    run_id=self._run_id,
+                    source=self._rules.source,
                     scorer=self._rules.source,
                     sequence=self.found.scores,
                     episode=self._episode,

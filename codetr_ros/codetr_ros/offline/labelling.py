@@ -176,16 +176,16 @@ def _label(
                 'is far from what the model was trained on, or training had diverged'
             )
         yield StepRewards(
-            key.run_id,
-            0,
-            method.version,
-            0,
-            0,
-            key.source,
-            np.repeat([s.episode for s in part], [len(s.segments.firsts) for s in part]).astype(
-                np.uint32
-            ),
-            np.concatenate([s.segments.firsts for s in part]).astype(np.uint32),
-            lengths.astype(np.uint32),
-            values,
+            run_id=key.run_id,
+            phase=0,
+            version=method.version,
+            part=0,
+            parts=0,
+            source=key.source,
+            episodes=np.repeat(
+                [s.episode for s in part], [len(s.segments.firsts) for s in part]
+            ).astype(np.uint32),
+            first_steps=np.concatenate([s.segments.firsts for s in part]).astype(np.uint32),
+            lengths=lengths.astype(np.uint32),
+            labels=values,
         )

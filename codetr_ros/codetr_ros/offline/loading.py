@@ -85,7 +85,15 @@ def load(
     for episode, stretch in enumerate(loaded.stretches):
         if stretch in true:
             loaded.memory.append_true_rewards(
-                TrueRewards('', SOURCE, episode, 0, episode, 0, true[stretch])
+                TrueRewards(
+                    run_id='',
+                    source=SOURCE,
+                    sequence=episode,
+                    phase=0,
+                    episode=episode,
+                    first_step=0,
+                    rewards=true[stretch],
+                )
             )
     return loaded
 
@@ -122,8 +130,8 @@ def _add(filling: _Filling, loaded: Loaded) -> None:
     stretch, episode = filling.stretch, len(loaded.stretches)
     loaded.memory.append(
         Transitions(
-            '',
-            SOURCE,
+            run_id='',
+            source=SOURCE,
             sequence=episode,
             phase=0,
             episode=episode,
@@ -139,7 +147,16 @@ def _add(filling: _Filling, loaded: Loaded) -> None:
     )
     for first, length, value in zip(*(part.tolist() for part in stretch.segments), strict=True):
         loaded.memory.score(
-            CompositeReward('', SOURCE, '', 0, episode, first - stretch.first, length, value)
+            CompositeReward(
+                run_id='',
+                source=SOURCE,
+                scorer='',
+                sequence=0,
+                episode=episode,
+                first_step=first - stretch.first,
+                length=length,
+                value=value,
+            )
         )
     loaded.stretches.append(stretch)
 

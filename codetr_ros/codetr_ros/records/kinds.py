@@ -2,8 +2,9 @@
 
 A record has the fields of its message, with the same names, in the same order (the message adds a
 `stamp`, which nothing learns from). Records know nothing of ROS; `codetr_ros.ros.messages` turns
-one into the other. Arrays are numpy; their shapes use T = steps, O = observation size, A = action
-size.
+one into the other. Fields are given by name: many of them are neighbours of one type, and two that
+changed places would be noticed by nobody. Arrays are numpy; their shapes use T = steps,
+O = observation size, A = action size.
 """
 
 from collections.abc import Mapping
@@ -36,7 +37,7 @@ class RecordError(ValueError):
     """A record that must not be taken in: the message names value, field, source and remedy."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class RunSpec:
     """What run this is, with every setting that its nodes share. From the learner to all."""
 
@@ -47,7 +48,7 @@ class RunSpec:
     settings_hash: str  # sha256 of `settings`
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Presence:
     """A node says that it is there: on start, once a second, and a last time when it has finished.
 
@@ -67,7 +68,7 @@ class Presence:
     missed: int  # lost on the way to this node, all topics together
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class TaskSpec:
     """What a source simulates. From each simulator to all."""
 
@@ -82,7 +83,7 @@ class TaskSpec:
     r_max: float  # the largest reward of one step, for score normalisation
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Policy:
     """The permission for one phase, with the policy to act under. From the learner to the
     simulators.
@@ -100,7 +101,7 @@ class Policy:
     weights: bytes  # safetensors
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Transitions:
     """Consecutive steps of one episode in one phase. From a simulator to recorder, reward and
     learner.
@@ -122,7 +123,7 @@ class Transitions:
     scores_due: int  # on phase_end: composite rewards due for segments that ended in this phase
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class CompositeReward:
     """The score of one segment. From whoever scores to recorder, reward or learner."""
 
@@ -136,7 +137,7 @@ class CompositeReward:
     value: float
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Commit:
     """A phase is on disk, whole: exactly this belongs to it. Recorder to reward and learner."""
 
@@ -149,7 +150,7 @@ class Commit:
     dropped: tuple[str, ...]  # sources left out of the phase: silent beyond the deadline
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class StepRewards:
     """New and changed labels after a phase, in parts. From reward to learner and recorder.
 
@@ -169,7 +170,7 @@ class StepRewards:
     labels: F32  # (sum of lengths,) segment after segment
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class EpisodeResult:
     """How one episode went. From simulators (training) and the evaluator to the recorder."""
 
@@ -188,7 +189,7 @@ class EpisodeResult:
     terminated: bool
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class TrueRewards:
     """The environment's own step rewards, for evaluation only: no node learns from them."""
 
@@ -201,7 +202,7 @@ class TrueRewards:
     rewards: F32  # (T,)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Metrics:
     """Named numbers at a step. From every node to recorder and people."""
 
@@ -249,7 +250,15 @@ def metrics(
 ) -> Metrics:
     """A `Metrics` record from names and values."""
     numbers = np.array(list(values.values()), np.float64)
-    return Metrics(run_id, role, node, phase, step, tuple(values), numbers)
+    return Metrics(
+        run_id=run_id,
+        role=role,
+        node=node,
+        phase=phase,
+        step=step,
+        names=tuple(values),
+        values=numbers,
+    )
 
 
 def describe(record: Record) -> str:

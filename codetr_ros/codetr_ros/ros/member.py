@@ -213,15 +213,15 @@ class Member:
         lost = self.lost()
         self.link.publish(
             Presence(
-                spec.run_id if spec else '',
-                self.role,
-                self.link.full_name,
-                self._instance,
-                spec.settings_hash if spec and self.core else '',
-                finished,
-                topics,
-                np.array([self.link.published[t] for t in topics], np.uint64),
-                sum(lost.values()),
+                run_id=spec.run_id if spec else '',
+                role=self.role,
+                node=self.link.full_name,
+                instance_id=self._instance,
+                settings_hash=spec.settings_hash if spec and self.core else '',
+                finished=finished,
+                topics=topics,
+                published=np.array([self.link.published[t] for t in topics], np.uint64),
+                missed=sum(lost.values()),
             )
         )
         counters = {

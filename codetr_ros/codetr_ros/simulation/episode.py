@@ -107,15 +107,15 @@ class Episode:
     ) -> EpisodeResult:
         """How the episode went. `source` to `episode` are the fields of the record."""
         return EpisodeResult(
-            run_id,
-            source,
-            purpose,
-            step,
-            version,
-            episode,
-            self.length,
-            float(self._rewards[: self.length].sum()),
-            self._composite_return,
-            self._composite_return / self._perfect,
-            self.terminated,
+            run_id=run_id,
+            source=source,
+            purpose=purpose,
+            step=step,
+            version=version,
+            episode=episode,
+            length=self.length,
+            true_return=float(self._rewards[: self.length].sum()),
+            composite_return=self._composite_return,
+            score=self._composite_return / self._perfect,
+            terminated=self.terminated,
         )

@@ -73,15 +73,15 @@ class Source:
         """What is simulated."""
         environment = self.environment
         return TaskSpec(
-            self._run.run_id,
-            PROTOCOL_VERSION,
-            self.name,
-            self._settings.task,
-            environment.observation_size,
-            environment.action_size,
-            environment.horizon,
-            environment.control_period,
-            r_max(self._settings, environment),
+            run_id=self._run.run_id,
+            protocol_version=PROTOCOL_VERSION,
+            source=self.name,
+            task=self._settings.task,
+            observation_size=environment.observation_size,
+            action_size=environment.action_size,
+            horizon=environment.horizon,
+            control_period=environment.control_period,
+            r_max=r_max(self._settings, environment),
         )
 
     def roll_out(self, policy: Policy, acting: ActingPolicy | None) -> Iterator[list[Record]]:
@@ -153,35 +153,43 @@ class Source:
         sequence = self._sequence
         phase_end = t == len(draws)
         chunk = Transitions(
-            run_id,
-            source,
-            sequence,
-            policy.phase,
-            number,
-            first_step,
-            t,
-            observations[: t + 1],
-            actions[:t],
-            episode.terminated,
-            episode.truncated,
-            phase_end,
-            self._scores + len(scores) - scores_before if phase_end else 0,
+            run_id=run_id,
+            source=source,
+            sequence=sequence,
+            phase=policy.phase,
+            episode=number,
+            first_step=first_step,
+            steps=t,
+            observations=observations[: t + 1],
+            actions=actions[:t],
+            terminated=episode.terminated,
+            truncated=episode.truncated,
+            phase_end=phase_end,
+            scores_due=self._scores + len(scores) - scores_before if phase_end else 0,
         )
         records: list[Record] = [
             chunk,
-            TrueRewards(run_id, source, sequence, policy.phase, number, first_step, rewards[:t]),
+            TrueRewards(
+                run_id=run_id,
+                source=source,
+                sequence=sequence,
+                phase=policy.phase,
+                episode=number,
+                first_step=first_step,
+                rewards=rewards[:t],
+            ),
         ]
         for score in scores:
             records.append(
                 CompositeReward(
-                    run_id,
-                    source,
-                    source,
-                    self._scores,
-                    number,
-                    score.first_step,
-                    score.length,
-                    score.value,
+                    run_id=run_id,
+                    source=source,
+                    scorer=source,
+                    sequence=self._scores,
+                    episode=number,
+                    first_step=score.first_step,
+                    length=score.length,
+                    value=score.value,
                 )
             )
             self._scores += 1
