@@ -10,7 +10,7 @@ import pytest
 from codetr_ros.bags.errors import Place
 from codetr_ros.bags.reader import Message
 from codetr_ros.config import SettingsError, validate
-from codetr_ros.offline import converting, mapping
+from codetr_ros.offline import converting, episode_scores, mapping
 from codetr_ros.offline.converting import Converter
 from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.mapping import Mapping
@@ -137,7 +137,7 @@ def test_a_last_step_after_which_nothing_was_observed_is_dropped():
     assert scores == [(0, 0, 1, 2.0)]
     assert dict(converter.found.dropped) == {
         converting.NO_NEXT: 1,
-        converting.SCORE_TRIMMED: 1,
+        episode_scores.SCORE_TRIMMED: 1,
     }
 
 
@@ -171,7 +171,7 @@ def test_what_is_not_finite_is_no_step():
     assert [s[2] for s in steps] == [[1.0, 1.1], [1.3, 1.4]]
     assert scores == []
     assert converter.found.dropped[converting.NOT_FINITE] == 1
-    assert converter.found.dropped[converting.SCORE_NOT_FINITE] == 1
+    assert converter.found.dropped[episode_scores.SCORE_NOT_FINITE] == 1
 
 
 def test_several_topics_are_one_observation_once_each_has_been_heard():
@@ -247,8 +247,8 @@ def test_a_score_may_be_of_the_last_steps_that_are_not_scored_yet():
         said(1.46, '/state', [0.0]),
     )
     assert scores == [(0, 1, 2, 2.0), (0, 3, 2, 4.0)]
-    assert converter.found.dropped[converting.SCORE_OF_NOTHING] == 1
-    assert converter.found.dropped[converting.SCORE_AGAIN] == 1
+    assert converter.found.dropped[episode_scores.SCORE_OF_NOTHING] == 1
+    assert converter.found.dropped[episode_scores.SCORE_AGAIN] == 1
 
 
 def test_an_episode_of_which_nothing_is_left_leaves_no_gap_in_the_numbers():
@@ -265,7 +265,7 @@ def test_an_episode_of_which_nothing_is_left_leaves_no_gap_in_the_numbers():
     )
     assert [s[0] for s in steps] == [0, 1]
     assert scores == [(1, 0, 1, 1.0)]
-    assert converter.found.dropped[converting.SCORE_DROPPED] == 1
+    assert converter.found.dropped[episode_scores.SCORE_DROPPED] == 1
 
 
 def test_long_episodes_come_in_chunks_that_join(monkeypatch):

@@ -22,6 +22,7 @@ HEAD = struct.Struct('<BQ')  # opcode, length of what follows
 CHUNK = struct.Struct('<QQQII')  # start, end, size, crc, length of the compression's name
 MESSAGE = struct.Struct('<BQHIQQ')  # head, channel, sequence, log time, publish time
 MESSAGE_BODY = MESSAGE.size - HEAD.size
+_MESSAGE_HEAD = struct.Struct('<HIQQ')  # the same without the head
 _PIECE = 1 << 20
 _SECTOR = 4096
 _LONGEST_START = HEAD.size + CHUNK.size + len('zstd') + 8  # of what `_CHUNK_START` matches
@@ -201,6 +202,60 @@ def _chunk_in(view: bytes, length: int, left: int) -> int | None:
             return found
         at = found + 1
     return None
+
+
+def chunk_data(content: bytes, named: int, size: int, crc: int) -> bytes | memoryview:
+    """The records of a chunk, decompressed.
+
+    Args:
+        content: of the chunk record.
+        named: length of the compression's name.
+        size: bytes when decompressed.
+        crc: of these bytes; 0 where the writer made none.
+
+    Raises:
+        FaultError: they cannot be decompressed, or their CRC is another.
+    """
+    name = bytes(content[CHUNK.size : CHUNK.size + named])
+    data = memoryview(content)[CHUNK.size + named + 8 :]
+    raw = decompressed(data, name.decode('ascii', 'replace'), size)
+    if crc and (actual := zlib.crc32(raw)) != crc:
+        raise FaultError(f'its CRC is {actual:#010x}, not {crc:#010x}')
+    return raw
+
+
+def next_record(file: BinaryIO, left: int) -> tuple[bytes, int, bytes]:
+    """The record that begins where the file stands, `left` bytes before the file's end.
+
+    Returns:
+        Its head, its opcode and its content.
+
+    Raises:
+        FaultError: it is cut off, of no kind, or longer than what is left or may be read.
+    """
+    head = file.read(HEAD.size)
+    if len(head) < HEAD.size:
+        raise FaultError(f'cut off within a record: {len(head)} bytes are left')
+    opcode, length = HEAD.unpack(head)
+    left -= HEAD.size
+    if not opcode:
+        raise FaultError('a record of kind 0, which there is not')
+    if length > left:
+        raise FaultError(f'a record of {length} bytes where {left} are left')
+    if length > LARGEST_RECORD:
+        raise FaultError(f'a record of {length} bytes: at most {LARGEST_RECORD} are read')
+    return head, opcode, file.read(length)
+
+
+def message_head(content: bytes) -> tuple[int, int, int, int]:
+    """Channel, sequence number, log time and publish time [ns] of a message record.
+
+    Raises:
+        FaultError: it is too short to have them.
+    """
+    if len(content) < MESSAGE_BODY:
+        raise FaultError(f'a message of {len(content)} bytes')
+    return _MESSAGE_HEAD.unpack_from(content)
 
 
 def summary_records(file: BinaryIO, size: int) -> list[Any]:

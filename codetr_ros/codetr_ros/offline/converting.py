@@ -11,21 +11,19 @@ The rules of time, where `now` is when a message was received (its log time):
 * The next observation of an episode's last step is what holds at its end, or as long after its
   begin as the step before took, where that is earlier. If nothing was observed in between, the
   step is dropped.
-* A score is of steps that began before it or with it. It belongs to the episode that is going on,
-  or has ended while no new one has begun. One of all steps since the last score is of one less
-  where the last step was dropped.
+* Which steps a score is of, `episode_scores` says.
 
 Whatever is dropped is counted.
 """
 
-from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from codetr_ros.bags.reader import Message
 from codetr_ros.offline import mapping
+from codetr_ros.offline.episode_scores import Conversion, EpisodeScores
 from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.mapping import Mapping
 from codetr_ros.records import F32, F64, MESSAGE_BYTES, CompositeReward, Transitions
@@ -38,30 +36,10 @@ NO_NEXT = 'last steps of episodes without an observation after them'
 CLIPPED = 'commands beyond low or high, clipped'
 NO_JOINTS = 'messages without all of the joints'
 BACKWARDS = 'messages received earlier than the one before, taken as simultaneous'
-SCORE_NOT_FINITE = 'scores that are not finite'
-SCORE_OF_NOTHING = 'scores of no step, or of fewer than are asked for'
-SCORE_AGAIN = 'scores of steps that were scored before'
-SCORE_DROPPED = 'scores of steps that were dropped'
-SCORE_TRIMMED = 'scores whose last step was dropped, taken as of those before it'
 
 
 Timed = tuple[Transitions | CompositeReward, int]
 """A record and its time [ns]."""
-
-
-@dataclass
-class Conversion:
-    """What became of a bag."""
-
-    messages: Counter[str] = field(default_factory=Counter)  # read, by topic
-    episodes: int = 0
-    steps: int = 0
-    scores: int = 0
-    scored_steps: int = 0
-    dropped: Counter[str] = field(default_factory=Counter)
-    sizes: tuple[int, int] = (0, 0)  # of observations and actions
-    shortest: float = float('inf')  # [s] between the begins of two steps
-    longest: float = 0.0
 
 
 @dataclass
@@ -96,9 +74,7 @@ class Converter:
         self._episode = -1
         self._open = False
         self._written = 0  # steps of the episode that were written
-        self._begun = 0  # steps of the episode that were begun and not dropped
-        self._scored = 0  # its steps before this one have had their score
-        self._scores: list[tuple[int, int, float]] = []  # first step, length, value
+        self._scores = EpisodeScores(rules, run_id, self.found)
         self._sequence = 0
 
     def feed(self, message: Message) -> Iterator[Timed]:
@@ -119,7 +95,7 @@ class Converter:
             if array is not None:
                 yield from self._commanded(array)
         if message.topic == self._rules.score.topic:
-            self._score(message)
+            self._scores.take(message)
         if message.topic == self._rules.episode.topic and self._ends(message):
             yield from self._end(self._rules.episode.terminal)
 
@@ -128,6 +104,11 @@ class Converter:
         yield from self._until(self._now + 1)
         yield from self._end(False)
         yield from self._give_scores()
+
+    def _give_scores(self) -> Iterator[Timed]:
+        """The scores of the episode that has ended, once no more can come."""
+        for score in self._scores.give(self._episode, self._written):
+            yield score, self._now
 
     def _numbers(self, message: Message, values: mapping.Values) -> F64 | None:
         array = mapping.numbers(message.message, values)
@@ -202,10 +183,11 @@ class Converter:
             yield from self._give_scores()
             self._open = True
             self._episode += 1
-            self._written = self._begun = self._scored = 0
+            self._written = 0
+            self._scores.begin_episode()
         self._pending = _Step(now, observation, action)
         self._then = None
-        self._begun += 1
+        self._scores.step_begun()
 
     def _complete(self, observation: F64) -> Iterator[Timed]:
         """The next observation of the pending step is known."""
@@ -230,7 +212,7 @@ class Converter:
             else:
                 self.found.dropped[NO_NEXT] += 1
                 self._pending = None
-                self._begun -= 1
+                self._scores.step_dropped()
         if self._steps:
             self.found.episodes += 1
             yield from self._write(terminal, not terminal)
@@ -284,54 +266,6 @@ class Converter:
         self._written += len(steps)
         self.found.steps += len(steps)
         yield chunk, self._now
-
-    # ------------------------------------------------------------------------------------------
-    # scores
-
-    def _score(self, message: Message) -> None:
-        rule = self._rules.score
-        value = mapping.field(message.message, rule.field, rule.topic)
-        try:
-            number = float(value)
-        except (TypeError, ValueError):
-            raise FitError(f'{rule.topic}: field {rule.field!r} holds no number') from None
-        length = self._begun - self._scored if rule.steps is None else rule.steps
-        first = self._begun - length
-        if not np.isfinite(number):
-            self.found.dropped[SCORE_NOT_FINITE] += 1
-        elif length < 1 or first < 0:
-            self.found.dropped[SCORE_OF_NOTHING] += 1
-        elif first < self._scored:
-            self.found.dropped[SCORE_AGAIN] += 1
-        else:
-            self._scores.append((first, length, number))
-            self._scored = self._begun
-
-    def _give_scores(self) -> Iterator[Timed]:
-        """The scores of the episode that has ended, once no more can come."""
-        scores, self._scores = self._scores, []
-        for first, length, value in scores:
-            there = min(length, self._written - first)
-            if there < length:
-                trimmed = self._rules.score.of == 'since_last' and there > 0
-                self.found.dropped[SCORE_TRIMMED if trimmed else SCORE_DROPPED] += 1
-                if not trimmed:
-                    continue
-            yield (
-                CompositeReward(
-                    run_id=self._run_id,
-                    source=self._rules.source,
-                    scorer=self._rules.source,
-                    sequence=self.found.scores,
-                    episode=self._episode,
-                    first_step=first,
-                    length=there,
-                    value=value,
-                ),
-                self._now,
-            )
-            self.found.scores += 1
-            self.found.scored_steps += there
 
 
 def _finite(values: F64) -> bool:
