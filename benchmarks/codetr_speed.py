@@ -19,8 +19,8 @@ through everything in turn; the table gives the median round, and the lowest and
 brackets.
 
 On a GPU (`--device cuda`) a third shape, 4096x4096 by 4096x4096, says what matrices reach there,
-and a memory of a million steps is labelled whole, 4096 segments at a time. The batches that it
-learns from are made on the CPU.
+and a memory of a million steps is labelled whole, 4096 segments at a time, or as many as each of
+`--label-batches` says. The batches that it learns from are made on the CPU.
 
 `--clock cpu` counts the time that the processor worked instead of the time on the wall: for one
 thread on a machine that does other things as well.
@@ -28,6 +28,7 @@ thread on a machine that does other things as well.
 
 import argparse
 import csv
+import itertools
 import statistics
 import sys
 import time
@@ -166,13 +167,12 @@ clock = 'wall'
 
 
 def measure(
-    delay: int, threads: int, precision: str, rounds: int, device: str
+    delay: int, threads: int, precision: str, label_batch: int, rounds: int, device: str
 ) -> list[dict[str, Any]]:
-    """All rounds of one delay, number of threads and precision."""
+    """All rounds of one delay, number of threads, precision and segments labelled at a time."""
     torch.set_num_threads(threads)
     changes: dict[str, Any] = {'delay': delay, 'threads': threads, 'codetr.precision': precision}
-    if device != 'cpu':
-        changes |= {'reward_device': device, 'codetr.label_batch': 4096}
+    changes |= {'reward_device': device, 'codetr.label_batch': label_batch}
     work = Work(load('paper').changed(changes))
     where = work.model.device
     tasks: dict[str, tuple[Callable[[], tuple[int, int]], int]] = {
@@ -194,7 +194,7 @@ def measure(
             floor = (before + products(where, precision)) / 2
             rows.append(
                 {'delay': delay, 'threads': threads, 'precision': precision}
-                | {'what': name, 'round': n}
+                | {'label_batch': label_batch, 'what': name, 'round': n}
                 | {'seconds': round(seconds, 5), 'units': units, 'flops': flops}
                 | {'products_gflops': round(floor / 1e9, 2)}
                 | {'ratio': round(flops / seconds / floor, 4)}
@@ -204,15 +204,17 @@ def measure(
     return rows
 
 
-SIZE = ('delay', 'threads', 'precision')
+SIZE = ('delay', 'threads', 'precision', 'label_batch')
 HEAD = (
-    '| n | threads | precision | products [GFLOP/s] | gradient steps/s | of the floor '
-    '| as written | labelled steps/s | of the floor | as written |\n' + 10 * '|---' + '|'
+    '| n | threads | precision | labelled at a time | products [GFLOP/s] | gradient steps/s '
+    '| of the floor | as written | labelled steps/s | of the floor | as written |\n'
+    + 11 * '|---'
+    + '|'
 )
 
 
 def line(rows: list[dict[str, Any]]) -> str:
-    """The table's line for one delay, number of threads and precision."""
+    """The table's line for one delay, number of threads, precision and label batch."""
     cells = [str(rows[0][name]) for name in SIZE]
     cells.append(f'{statistics.median(row["products_gflops"] for row in rows):.0f}')
     for what in ('gradient', 'label'):
@@ -249,6 +251,7 @@ def main() -> None:
     parser.add_argument('--delays', type=int, nargs='+', default=DELAYS)
     parser.add_argument('--threads', type=int, nargs='+', default=[1, 2])
     parser.add_argument('--precisions', nargs='+', default=['float32', 'bfloat16'])
+    parser.add_argument('--label-batches', type=int, nargs='+', help='256 on a CPU, else 4096')
     parser.add_argument('--rounds', type=int, default=7)
     parser.add_argument('--clock', choices=list(CLOCKS), default='wall')
     parser.add_argument('--device', default='cpu', help='cpu, cuda, cuda:1, ...')
@@ -256,17 +259,17 @@ def main() -> None:
     arguments = parser.parse_args()
     clock = arguments.clock
     load_before = machine.load()
-    print(HEAD, flush=True)
-    rows = []
-    for threads in arguments.threads:
-        for delay in arguments.delays:
-            for precision in arguments.precisions:
-                rows += measure(delay, threads, precision, arguments.rounds, arguments.device)
     facts = machine.facts(load_before, ('torch', 'numpy'))
     if arguments.device != 'cpu':
         facts['device'] = torch.cuda.get_device_name(arguments.device)
     facts |= {'clock': clock, 'rounds': str(arguments.rounds), 'command': ' '.join(sys.argv)}
-    write(rows, RESULTS / arguments.out, facts)
+    print(HEAD, flush=True)
+    rows = []
+    label_batches = arguments.label_batches or [256 if arguments.device == 'cpu' else 4096]
+    options = arguments.threads, arguments.delays, arguments.precisions, label_batches
+    for threads, delay, precision, label_batch in itertools.product(*options):
+        rows += measure(delay, threads, precision, label_batch, arguments.rounds, arguments.device)
+        write(rows, RESULTS / arguments.out, facts)  # what is cut off later is not lost
 
 
 if __name__ == '__main__':

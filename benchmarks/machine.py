@@ -14,7 +14,12 @@ LOUD = 0.5
 
 
 def commit(checkout: Path = HERE) -> str:
-    """The commit that is measured, marked where tracked files other than results have changed."""
+    """The commit that is measured, marked where tracked files other than results have changed.
+
+    A copy without git's folder, on a machine that cannot fetch, is told it by `CODETR_COMMIT`.
+    """
+    if checkout == HERE and (told := os.environ.get('CODETR_COMMIT')):
+        return told
 
     def git(*arguments: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(

@@ -154,36 +154,35 @@ def measure(task: str, arguments: argparse.Namespace) -> tuple[list[dict[str, An
                 | {'first_s': round(first[name], 2)}
             )
     for name, sac in made.items():
-        profiles.append(f'### {task}, {name}\n\n{profiled(sac, device)}')
+        kernels = profiled(lambda sac=sac: sac.replay(PROFILED), device, PROFILED)
+        profiles.append(f'### {task}, {name}\n\n{kernels}')
     return rows, '\n\n'.join(profiles)
 
 
-def profiled(sac: DeviceSAC, device: str) -> str:
-    """What the device does for some updates: its kernels, the longest ones first."""
+def profiled(call: Callable[[], object], device: str, times: int) -> str:
+    """What the device does while something is done so many times: the longest kernels first."""
     activities = [ProfilerActivity.CPU]
     if device != 'cpu':
         activities.append(ProfilerActivity.CUDA)
     with profile(activities=activities) as found:
-        whole = seconds(lambda: sac.replay(PROFILED), device)
+        whole = seconds(call, device)
     kind = DeviceType.CPU if device == 'cpu' else DeviceType.CUDA
     time_of = 'self_cpu_time_total' if device == 'cpu' else 'self_device_time_total'
     kernels = [event for event in found.key_averages() if event.device_type == kind]
     kernels.sort(key=lambda event: -getattr(event, time_of))
-    busy = sum(getattr(event, time_of) for event in kernels) / PROFILED
-    calls = sum(event.count for event in kernels) / PROFILED
+    busy = sum(getattr(event, time_of) for event in kernels) / times
+    calls = sum(event.count for event in kernels) / times
     lines = [
-        f'{calls:.0f} kernels and copies an update, {busy:.0f} us of {1e6 * whole / PROFILED:.0f} '
+        f'{calls:.0f} kernels and copies each time, {busy:.0f} us of {1e6 * whole / times:.0f} '
         'us (the profiler itself takes time).',
         '',
-        '| kernel | an update | us an update | share |',
+        '| kernel | each time | us each time | share |',
         '|---|---:|---:|---:|',
     ]
     for event in kernels[:TOP]:
-        took = getattr(event, time_of) / PROFILED
+        took = getattr(event, time_of) / times
         name = event.key[:90].replace('|', '/')
-        lines.append(
-            f'| `{name}` | {event.count / PROFILED:.1f} | {took:.1f} | {took / busy:.0%} |'
-        )
+        lines.append(f'| `{name}` | {event.count / times:.1f} | {took:.1f} | {took / busy:.0%} |')
     return '\n'.join(lines)
 
 
@@ -228,16 +227,26 @@ def main() -> None:
     parser.add_argument('--rounds', type=int, default=5)
     parser.add_argument('--batch', type=int, default=256)
     parser.add_argument('--width', type=int, default=256)
-    parser.add_argument('--only', choices=list(SIZES), help='one size')
+    parser.add_argument('--only', nargs='+', choices=list(SIZES), help='some of the sizes')
     parser.add_argument('--out', type=Path, default=RESULTS)
     arguments = parser.parse_args()
     facts = machine.facts(machine.load(), ['torch', 'numpy']) | device_facts(arguments.device)
     rows, profiles = [], []
-    for task in [arguments.only] if arguments.only else SIZES:
-        some, said = measure(task, arguments)
+    for task in arguments.only or SIZES:
+        some, text = measure(task, arguments)
         rows += some
-        profiles.append(said)
+        profiles.append(text)
         print('\n'.join(table(some)), flush=True)
+        write(rows, profiles, facts, arguments)  # what is cut off later is not lost
+
+
+def write(
+    rows: list[dict[str, Any]],
+    profiles: list[str],
+    facts: dict[str, str],
+    arguments: argparse.Namespace,
+) -> None:
+    """The CSV file of all rounds, the table and what the machine is."""
     arguments.out.mkdir(parents=True, exist_ok=True)
     with (arguments.out / 'rounds.csv').open('w', newline='') as file:
         writer = csv.DictWriter(file, list(rows[0]))

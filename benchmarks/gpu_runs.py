@@ -1,0 +1,260 @@
+"""Short runs, stage by stage: what a GPU brings, and what each thing that can be switched does.
+
+    .venv/bin/python benchmarks/gpu_runs.py
+
+All runs are made in one process, in process (`codetr train --in-process` without its summary),
+with networks of the paper's size on HalfCheetah-v5, SAC and the reward transformer both on the
+device. A round goes through all of them in turn, every other round backwards. Groups:
+  - device: 3000 steps on the CPU with one thread, in the first round only, and on the device
+  - options: 10 000 steps: SAC's graph, the same compiled before, bfloat16, 256 labels at a time
+  - steps: 10 000 steps, evaluations included, by `codetr_ros.gymnasium_steps` or by Gymnasium
+  - threads: 4000 steps of eight environments in one simulator, in threads where the simulator
+    finds them faster, never, and always
+
+Columns: seconds from the first permission to simulate to the end, and of them what each stage
+took; `else` is messages, policies and checkpoints. `GPU busy` is the share of time in which the
+driver saw a kernel run. The median round, and the lowest and highest in brackets.
+"""
+
+import argparse
+import csv
+import statistics
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import machine
+from codetr_ros import gymnasium_steps, in_process
+from codetr_ros.config import Settings, load
+from codetr_ros.records import Metrics, Policy, Record
+from codetr_ros.simulator import Simulator
+from sac_gpu import device_facts
+
+RESULTS = Path(__file__).parent / 'results' / 'gpu_check'
+STAGES = ('simulate', 'fit', 'label', 'update')
+"""What the parts of a run say of their work, in metrics NAME_seconds."""
+WORK = {'fit': 'gradient_steps', 'update': 'updates'}
+SMALL = {'phase_steps': 100, 'codetr.layers': 1, 'codetr.embedding': 16, 'sac.hidden': (16,)}
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A run that is compared with the others of its group.
+
+    Attributes:
+        group: with what it is compared.
+        name: what is different about it.
+        changes: of the settings.
+        gymnasium: whether Gymnasium steps its own environments.
+        threads: of the simulator; None: as it finds.
+        once: in the first round only.
+    """
+
+    group: str
+    name: str
+    changes: dict[str, Any] = field(default_factory=dict)
+    gymnasium: bool = False
+    threads: int | None = None
+    once: bool = False
+
+
+def variants(device: str) -> list[Variant]:
+    """All runs of a round."""
+    there = {'device': device, 'reward_device': device, 'codetr.label_batch': 4096}
+    here = {'device': 'cpu', 'reward_device': 'cpu', 'sac.compile': True}
+    short = {'steps': 3000, 'codetr.first_gradient_steps': 20}
+    long = there | {'steps': 10_000, 'evaluate_every': 0}
+    evaluated = there | {'steps': 10_000, 'evaluate_every': 5000}
+    many = there | {'steps': 4000, 'evaluate_every': 0, 'envs': 8, 'codetr.gradient_steps': 1}
+    found = [
+        Variant('device', 'CPU', short | here, once=True),
+        Variant('device', device, short | there),
+        Variant('options', 'graph', long),
+        Variant('options', 'compiled graph', long | {'sac.compile': device != 'cpu'}),
+        Variant('options', 'bfloat16', long | {'codetr.precision': 'bfloat16'}),
+        Variant('options', '256 labels at a time', long | {'codetr.label_batch': 256}),
+        Variant('steps', 'ours', evaluated),
+        Variant('steps', "Gymnasium's", evaluated, gymnasium=True),
+    ]
+    for task in ('HalfCheetah-v5', 'Humanoid-v5'):
+        for name, threads in (('as found', None), ('none', 1), ('always 8', 8)):
+            found.append(Variant(f'threads, {task}', name, many | {'task': task}, threads=threads))
+    return found
+
+
+def settings_of(variant: Variant, smallest: bool) -> Settings:
+    """The settings of a run."""
+    usual = {'task': 'HalfCheetah-v5', 'warmup_steps': 1000, 'sac.compile': False}
+    changes = usual | {'codetr.first_gradient_steps': 100, **variant.changes}
+    if smallest:
+        changes |= {**SMALL, 'steps': 300, 'warmup_steps': 100, 'sac.compile': False}
+        changes |= {'codetr.first_gradient_steps': 2, 'evaluate_episodes': 1}
+    return load('paper').changed(changes)
+
+
+class Watch:
+    """Looks at a run's records and at the clock, and at the GPU while it runs."""
+
+    def __init__(self, device: str) -> None:
+        self.began: float | None = None
+        self.totals: Counter[str] = Counter()
+        self._latest: dict[str, float] = {}
+        self._device, self._busy = device, list[float]()
+        self._over = threading.Event()
+
+    def receive(self, record: Record) -> None:
+        """Note the first permission, and what the stages say."""
+        if isinstance(record, Policy) and self.began is None:
+            self.began = time.perf_counter()
+        if isinstance(record, Metrics):
+            for name, value in zip(record.names, record.values.tolist(), strict=True):
+                self._latest[name] = value
+                if name.endswith('_seconds') or name == 'steps_labelled':
+                    self.totals[name] += value
+
+    @contextmanager
+    def sampling(self) -> Iterator[None]:
+        """Ask the driver ten times a second how busy the GPU is, if it can be asked."""
+        thread = threading.Thread(target=self._sample, daemon=True)
+        if self._device != 'cpu':
+            thread.start()
+        try:
+            yield
+        finally:
+            self._over.set()
+            if self._device != 'cpu':
+                thread.join()
+
+    def _sample(self) -> None:
+        while not self._over.wait(0.1):
+            if self.began is None:
+                continue
+            try:
+                self._busy.append(torch.cuda.utilization(self._device))
+            except (ModuleNotFoundError, RuntimeError):  # no NVML for Python
+                return
+
+    def row(self) -> dict[str, float | str]:
+        """What was noted, once the run is over."""
+        assert self.began is not None
+        row: dict[str, float | str] = {'seconds': time.perf_counter() - self.began}
+        row |= {stage: self.totals[f'{stage}_seconds'] for stage in STAGES}
+        row |= {name: self._latest.get(name, 0.0) for name in WORK.values()}
+        row['steps_labelled'] = self.totals['steps_labelled']
+        row['gpu_busy'] = statistics.mean(self._busy) / 100 if self._busy else ''
+        return row
+
+
+@contextmanager
+def switched(variant: Variant) -> Iterator[None]:
+    """The library as a variant has it."""
+    ours = gymnasium_steps.stepper
+    if variant.gymnasium:
+        gymnasium_steps.stepper = lambda env: None
+    if variant.threads:
+        in_process.Simulator = partial(Simulator, threads=variant.threads)
+    try:
+        yield
+    finally:
+        gymnasium_steps.stepper = ours
+        in_process.Simulator = Simulator
+
+
+def one_run(variant: Variant, device: str, smallest: bool) -> dict[str, float | str]:
+    """One run of a variant; what it took."""
+    settings, watch = settings_of(variant, smallest), Watch(device)
+    with switched(variant), tempfile.TemporaryDirectory() as folder, watch.sampling():
+        reports = in_process.run(settings, 'run', Path(folder), watch.receive)
+        row = watch.row()
+    row['evaluate'] = reports['evaluate']['cpu_s']
+    used = sum(float(row[stage]) for stage in (*STAGES, 'evaluate'))
+    row['else'] = float(row['seconds']) - used
+    return {'steps': settings.steps} | row
+
+
+def table(rows: list[dict[str, Any]]) -> list[str]:
+    """A line for each variant, group by group."""
+    columns = ('seconds', *STAGES, 'evaluate', 'else')
+    head = ['group', 'run', 'steps', *columns, 'ms a gradient step', 'updates/s', 'labels/s']
+    lines = [
+        f'| {" | ".join([*head, "GPU busy"])} |',
+        '|---|---' + (len(head) - 1) * '|---:' + '|',
+    ]
+    for group, name in dict.fromkeys((row['group'], row['run']) for row in rows):
+        some = [row for row in rows if (row['group'], row['run']) == (group, name)]
+        cells = [group, name, str(some[0]['steps'])]
+        cells += [machine.spread([row[column] for row in some], '.2f') for column in columns]
+        for stage, work, form in (
+            ('fit', 'gradient_steps', '.1f'),
+            ('update', 'updates', '.0f'),
+            ('label', 'steps_labelled', '.0f'),
+        ):
+            rates = [row[work] / row[stage] for row in some if row[stage]]
+            values = [1000 / rate for rate in rates] if stage == 'fit' else rates
+            cells.append(f'{statistics.median(values):{form}}' if values else '')
+        busy = [row['gpu_busy'] for row in some if row['gpu_busy'] != '']
+        cells.append(f'{statistics.median(busy):.0%}' if busy else '')
+        lines.append(f'| {" | ".join(cells)} |')
+    return lines
+
+
+def write(rows: list[dict[str, Any]], facts: dict[str, str], out: Path) -> None:
+    """The CSV file of all runs, and the table."""
+    out.mkdir(parents=True, exist_ok=True)
+    with (out / 'runs.csv').open('w', newline='') as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        for row in rows:
+            numbers = {k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()}
+            writer.writerow(numbers)
+    lines = ['# Short runs, stage by stage', '']
+    lines += [f'- {name}: {value}' for name, value in facts.items()]
+    lines += ['', 'Median round [lowest, highest]. What is compared: `benchmarks/gpu_runs.py`.']
+    (out / 'runs.md').write_text('\n'.join([*lines, '', *table(rows)]) + '\n')
+
+
+def main() -> int:
+    """The command line; the exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument('--device', default='cuda')
+    parser.add_argument('--rounds', type=int, default=3)
+    parser.add_argument('--groups', nargs='+', metavar='GROUP', help='those that begin so')
+    parser.add_argument('--smallest', action='store_true', help='only show that it works')
+    parser.add_argument('--out', type=Path, default=RESULTS)
+    arguments = parser.parse_args()
+    device, smallest = arguments.device, arguments.smallest
+    facts = machine.facts(machine.load(), ('torch', 'numpy', 'mujoco')) | device_facts(device)
+    chosen = [
+        variant
+        for variant in variants(device)
+        if any(map(variant.group.startswith, arguments.groups or ['']))
+    ]
+    # does not count: what libraries set up at their first use
+    one_run(Variant('', '', chosen[-1].changes), device, smallest=True)
+    rows: list[dict[str, Any]] = []
+    for n in range(1 if smallest else arguments.rounds):
+        for variant in chosen[:: -1 if n % 2 else 1]:
+            if n and variant.once:
+                continue
+            took = one_run(variant, device, smallest)
+            rows.append({'group': variant.group, 'run': variant.name, 'round': n} | took)
+            print(variant.group, variant.name, f'{took["seconds"]:.2f} s', flush=True)
+            write(rows, facts, arguments.out)
+    print('\n'.join(table(rows)))
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
