@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 from codetr_ros.cli import doctor
 from codetr_ros.config import SacSettings
@@ -54,6 +55,21 @@ def test_a_cache_that_cannot_be_written_to_is_named_with_the_way_out(tmp_path, m
         FlatSAC(3, 1, SacSettings(hidden=(8,), compile=True), 0)
     for part in (f'{tmp_path}/file/cache', 'TORCHINDUCTOR_CACHE_DIR to a', 'sac.compile=false'):
         assert part in str(error.value)
+
+
+@pytest.mark.slow
+def test_a_torch_that_is_older_than_one_of_the_options_compiles_too(monkeypatch):
+    """As on a GPU machine that brings torch 2.11: these are all arguments that it takes."""
+    newer = torch.compile
+
+    def older(model, *, fullgraph, dynamic, backend='inductor', mode=None, options=None):
+        more = {'fullgraph': fullgraph, 'dynamic': dynamic, 'options': options}
+        return newer(model, backend=backend, mode=mode, **more)
+
+    monkeypatch.setattr(torch, 'compile', older)
+    numbers = torch.arange(5.0)
+    doubled = compilation.compiled(lambda x: x + x, [numbers], without='this=false')
+    assert doubled(numbers).tolist() == [0, 2, 4, 6, 8]
 
 
 BROKEN = """#!/bin/sh

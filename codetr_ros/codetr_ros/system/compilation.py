@@ -4,6 +4,7 @@ What was built is kept and found again by the next run, in `cache_folder()`. Thi
 torch only when something is compiled, so that `codetr doctor` can ask what is missing.
 """
 
+import inspect
 import os
 import shutil
 import sys
@@ -70,11 +71,14 @@ def compiled(function: _Function, example: Sequence[Any], without: str) -> _Func
     options: dict[str, Any] = {
         'fullgraph': True,
         'dynamic': False,
-        'isolate_recompiles': True,  # as often as there are learners in this process
         # For a CPU one C++ file for all, the calls of matrix products included: it is built sooner
         # than a file for each kernel, and Python has nothing left to do between them.
         'options': {'cpp_wrapper': example[0].device.type == 'cpu'},
     }
+    # As often as there are learners in this process. A GPU machine may bring a torch of its own: an
+    # older one (2.11) has no such option, and compiles for as many as its recompile limit allows.
+    if 'isolate_recompiles' in inspect.signature(torch.compile).parameters:
+        options['isolate_recompiles'] = True
     result = cast(_Function, torch.compile(function, **options))
     try:
         result(*example)
