@@ -18,9 +18,10 @@ tokens that nobody reads and the products that are then masked, which are left o
 through everything in turn; the table gives the median round, and the lowest and highest in
 brackets.
 
-On a GPU (`--device cuda`) a third shape, 4096x4096 by 4096x4096, says what matrices reach there,
-and a memory of a million steps is labelled whole, 4096 segments at a time, or as many as each of
-`--label-batches` says. The batches that it learns from are made on the CPU.
+On a GPU (`--device cuda`) 4096x4096 by 4096x4096 takes the place of the first shape, as so small
+ones reach little there, and a memory of a million steps is labelled whole, 4096 segments at a
+time, or as many as each of `--label-batches` says, in parts whose activations take a gigabyte, or
+as much as each of `--part-mib` says. The batches that it learns from are made on the CPU.
 
 `--clock cpu` counts the time that the processor worked instead of the time on the wall: for one
 thread on a machine that does other things as well.
@@ -43,6 +44,7 @@ import machine
 from codetr_ros.config import Settings, load
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import CompositeReward, Transitions
+from codetr_ros.rewards import sequence
 from codetr_ros.rewards.codetr import Codetr
 from codetr_ros.seeding import generator, seed_torch
 from cost import Cost
@@ -140,7 +142,7 @@ def products(device: torch.device, precision: str) -> float:
     best = 0.0
     options: dict[str, Any] = {'device': device, 'dtype': getattr(torch, precision)}
     on_gpu = device.type != 'cpu'
-    for rows, inner, columns in (*SHAPES, LARGE) if on_gpu else SHAPES:
+    for rows, inner, columns in (SHAPES[1], LARGE) if on_gpu else SHAPES:
         a = torch.randn(rows, inner, **options)
         b = torch.randn(inner, columns, **options)
         out = torch.empty(rows, columns, **options)
@@ -166,11 +168,11 @@ CLOCKS: dict[str, Callable[[], float]] = {'wall': time.perf_counter, 'cpu': time
 clock = 'wall'
 
 
-def measure(
-    delay: int, threads: int, precision: str, label_batch: int, rounds: int, device: str
-) -> list[dict[str, Any]]:
-    """All rounds of one delay, number of threads, precision and segments labelled at a time."""
+def measure(options: tuple[Any, ...], rounds: int, device: str) -> list[dict[str, Any]]:
+    """All rounds with some options, in the order of `OPTIONS`."""
+    delay, threads, precision, label_batch, part_mib = options
     torch.set_num_threads(threads)
+    sequence.DEVICE_PART_BYTES = part_mib << 20
     changes: dict[str, Any] = {'delay': delay, 'threads': threads, 'codetr.precision': precision}
     changes |= {'reward_device': device, 'codetr.label_batch': label_batch}
     work = Work(load('paper').changed(changes))
@@ -193,8 +195,8 @@ def measure(
             # a virtual machine's speed changes within seconds
             floor = (before + products(where, precision)) / 2
             rows.append(
-                {'delay': delay, 'threads': threads, 'precision': precision}
-                | {'label_batch': label_batch, 'what': name, 'round': n}
+                dict(zip(OPTIONS, options, strict=True))
+                | {'what': name, 'round': n}
                 | {'seconds': round(seconds, 5), 'units': units, 'flops': flops}
                 | {'products_gflops': round(floor / 1e9, 2)}
                 | {'ratio': round(flops / seconds / floor, 4)}
@@ -204,18 +206,18 @@ def measure(
     return rows
 
 
-SIZE = ('delay', 'threads', 'precision', 'label_batch')
+OPTIONS = ('delay', 'threads', 'precision', 'label_batch', 'part_mib')
 HEAD = (
-    '| n | threads | precision | labelled at a time | products [GFLOP/s] | gradient steps/s '
-    '| of the floor | as written | labelled steps/s | of the floor | as written |\n'
-    + 11 * '|---'
+    '| n | threads | precision | labelled at a time | part [MiB] | products [GFLOP/s] '
+    '| gradient steps/s | of the floor | as written | labelled steps/s | of the floor | as written |\n'
+    + 12 * '|---'
     + '|'
 )
 
 
 def line(rows: list[dict[str, Any]]) -> str:
-    """The table's line for one delay, number of threads, precision and label batch."""
-    cells = [str(rows[0][name]) for name in SIZE]
+    """The table's line for the rounds of some options."""
+    cells = [str(rows[0][name]) for name in OPTIONS]
     cells.append(f'{statistics.median(row["products_gflops"] for row in rows):.0f}')
     for what in ('gradient', 'label'):
         mine = [row for row in rows if row['what'] == what]
@@ -234,7 +236,7 @@ def write(rows: list[dict[str, Any]], out: Path, facts: dict[str, str]) -> None:
         writer.writerows(rows)
     of: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in rows:
-        of.setdefault(tuple(row[name] for name in SIZE), []).append(row)
+        of.setdefault(tuple(row[name] for name in OPTIONS), []).append(row)
     text = ['# Gradient steps and labels of CoDeTr per second', '']
     text += [f'- {name}: {value}' for name, value in facts.items()]
     text += ['', 'Median round [lowest, highest]. What is measured: `benchmarks/codetr_speed.py`.']
@@ -252,6 +254,7 @@ def main() -> None:
     parser.add_argument('--threads', type=int, nargs='+', default=[1, 2])
     parser.add_argument('--precisions', nargs='+', default=['float32', 'bfloat16'])
     parser.add_argument('--label-batches', type=int, nargs='+', help='256 on a CPU, else 4096')
+    parser.add_argument('--part-mib', type=int, nargs='+', default=[1024], help='of a GPU only')
     parser.add_argument('--rounds', type=int, default=7)
     parser.add_argument('--clock', choices=list(CLOCKS), default='wall')
     parser.add_argument('--device', default='cpu', help='cpu, cuda, cuda:1, ...')
@@ -266,9 +269,10 @@ def main() -> None:
     print(HEAD, flush=True)
     rows = []
     label_batches = arguments.label_batches or [256 if arguments.device == 'cpu' else 4096]
-    options = arguments.threads, arguments.delays, arguments.precisions, label_batches
-    for threads, delay, precision, label_batch in itertools.product(*options):
-        rows += measure(delay, threads, precision, label_batch, arguments.rounds, arguments.device)
+    lists = (arguments.threads, arguments.delays, arguments.precisions, label_batches)
+    for threads, delay, *others in itertools.product(*lists, arguments.part_mib):
+        options = (delay, threads, *others)
+        rows += measure(options, arguments.rounds, arguments.device)
         write(rows, RESULTS / arguments.out, facts)  # what is cut off later is not lost
 
 

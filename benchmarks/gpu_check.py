@@ -99,7 +99,7 @@ def steps(device: str, smallest: bool, out: Path) -> list[Step]:
         train += ['--steps', '6000']
         sac += ['--only', 'HalfCheetah', 'Ant 105', '--updates', '1000']
         codetr += ['--delays', '25', '100']
-        labels += ['--label-batches', '256', '1024', '16384']
+        labels += ['--label-batches', '256', '1024', '16384', '--part-mib', '128', '1024', '4096']
     small = ['--smallest'] if smallest else []
     runs = ['gpu_runs.py', '--device', device, '--out', str(out), *small]
     profile = ['gpu_profile.py', '--device', device, '--out', str(out), *small]
@@ -107,7 +107,7 @@ def steps(device: str, smallest: bool, out: Path) -> list[Step]:
         Step('tests', [*pytest, f'--junit-xml={out / "logs" / "tests.xml"}'], 120, 'tests.csv'),
         Step('command', train, 60, ''),
         Step('sac', sac, 100, 'sac/table.md'),
-        Step('codetr', [*codetr, '--out', str(out / 'codetr')], 60, 'codetr.md'),
+        Step('codetr', [*codetr, '--out', str(out / 'codetr')], 90, 'codetr.md'),
         Step('profile', profile, 60, 'profile.md'),
         Step(
             'label_batches', [*labels, '--out', str(out / 'label_batches')], 45, 'label_batches.md'
