@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from codetr_ros.config import CodetrSettings
 from codetr_ros.cores import in_process
 from codetr_ros.memory import on_device
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import CompositeReward, Transitions
-from codetr_ros.rewards import learned, registry
+from codetr_ros.rewards import learned, registry, transformer
 from codetr_ros.rewards.base import segment_steps
 from codetr_ros.rewards.learned import Learned
 from codetr_ros.runs import checkpoints
@@ -191,3 +192,17 @@ def test_a_state_goes_from_one_device_to_another_and_the_same_seed_learns_the_sa
     there.load_state({name: tensor.cpu() for name, tensor in ours.state().items()})
     assert checkpoints.digest(there.state()) == checkpoints.digest(ours.state())
     np.testing.assert_allclose(ours.label(batch), there.label(batch), rtol=1e-3, atol=1e-3)
+
+
+@needs_gpu
+@pytest.mark.parametrize('tokens', ['pair', 'merged'])
+def test_no_plan_is_made_for_each_number_of_windows_that_a_gpu_labels(tokens):
+    """cuDNN makes one for its attention; the memory has more segments in each phase."""
+    chosen = CodetrSettings(layers=2, precision='bfloat16', tokens=tokens)
+    network = transformer.CausalTransformer(OBSERVATION, ACTION, 25, chosen).cuda().eval()
+    steps = (torch.randn(40, 25, size, device='cuda') for size in (OBSERVATION, ACTION))
+    with torch.inference_mode(), torch.profiler.profile() as looked:
+        network(*steps)
+        torch.cuda.synchronize()
+    kernels = [event.key for event in looked.key_averages() if event.self_device_time_total]
+    assert kernels and not [name for name in kernels if 'cudnn' in name]

@@ -17,9 +17,15 @@ from contextlib import nullcontext
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from codetr_ros.config import CodetrSettings
 from codetr_ros.rewards.dropout import add_dropped, keep_mask
+
+KERNELS = [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION, SDPBackend.MATH]
+"""Of torch's ways to attend all but cuDNN's, which makes a plan for every other number of windows:
+as the memory grows there is one in every phase.
+"""
 
 
 class CausalSelfAttention(nn.Module):
@@ -134,7 +140,7 @@ class CausalTransformer(nn.Module):
             h = h * keep_mask(h.shape, self.dropout, h.device)
         *others, last = self.blocks
         rounded = torch.autocast(h.device.type, torch.bfloat16) if self.rounded else nullcontext()
-        with rounded:
+        with rounded, sdpa_kernel(KERNELS):
             for block in others:
                 h = block(h)
             h = last(h, 2 if self.pair else 1)
