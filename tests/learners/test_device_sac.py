@@ -258,10 +258,11 @@ def test_nobody_waits_for_the_gpu_between_replays():
 
 @needs_gpu
 @pytest.mark.slow
-def test_compiled_and_recorded_updates_end_where_plain_ones_end():
+def test_compiled_and_recorded_updates_end_where_plain_ones_end(recwarn):
     memory = Run().filled()
     eager = make('cuda', record=lambda call: call)
     fast = DeviceSAC(*SIZES, settings(compile=True), 0, 'cuda')
+    assert not [w for w in recwarn if 'TensorFloat32' in str(w.message)]  # nobody asked for it
     for sac in (eager, fast):
         sac.take(memory)
         replay(sac, 100)

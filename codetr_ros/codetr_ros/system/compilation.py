@@ -10,6 +10,7 @@ import shutil
 import sys
 import sysconfig
 import tempfile
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -75,13 +76,16 @@ def compiled(function: _Function, example: Sequence[Any], without: str) -> _Func
         # than a file for each kernel, and Python has nothing left to do between them.
         'options': {'cpp_wrapper': example[0].device.type == 'cpu'},
     }
-    # As often as there are learners in this process. A GPU machine may bring a torch of its own: an
+    # As often as there are learners in this process. A GPU machine may bring its own torch: an
     # older one (2.11) has no such option, and compiles for as many as its recompile limit allows.
     if 'isolate_recompiles' in inspect.signature(torch.compile).parameters:
         options['isolate_recompiles'] = True
     result = cast(_Function, torch.compile(function, **options))
     try:
-        result(*example)
+        with warnings.catch_warnings():
+            # whoever wants fewer digits than float32 has chooses a precision in the settings
+            warnings.filterwarnings('ignore', message='TensorFloat32 tensor cores')
+            result(*example)
     except TorchDynamoException as error:
         said = str(error).split('Set TORCHDYNAMO_VERBOSE')[0].strip()
         device = example[0].device.type
