@@ -209,9 +209,8 @@ def measure(options: tuple[Any, ...], rounds: int, device: str) -> list[dict[str
 OPTIONS = ('delay', 'threads', 'precision', 'label_batch', 'part_mib')
 HEAD = (
     '| n | threads | precision | labelled at a time | part [MiB] | products [GFLOP/s] '
-    '| gradient steps/s | of the floor | as written | labelled steps/s | of the floor | as written |\n'
-    + 12 * '|---'
-    + '|'
+    '| gradient steps/s | of the floor | as written '
+    '| labelled steps/s | of the floor | as written |\n' + 12 * '|---' + '|'
 )
 
 

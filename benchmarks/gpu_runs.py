@@ -4,9 +4,11 @@
 
 All runs are made in one process, in process (`codetr train --in-process` without its summary),
 with networks of the paper's size on HalfCheetah-v5, SAC and the reward transformer both on the
-device. A round goes through all of them in turn, every other round backwards. Groups:
-  - device: 3000 steps on the CPU with one thread, in the first round only, and on the device
-  - options: 10 000 steps: SAC's graph, the same compiled before, bfloat16, 256 labels at a time
+device. A round goes through all of them in turn, every other round backwards, as long
+as there is time for another. Groups:
+  - device: 2000 steps on the CPU with one thread, in the first round only, and on the device
+  - options: 6000 steps: SAC's graph, the same compiled before, bfloat16 (and with cuDNN's
+    attention), 256 segments labelled at a time
   - steps: 10 000 steps, evaluations included, by `codetr_ros.gymnasium_steps` or by Gymnasium
   - threads: 4000 steps of eight environments in one simulator, in threads where the simulator
     finds them faster, never, and always
@@ -32,11 +34,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch.nn.attention import SDPBackend
 
 import machine
 from codetr_ros import gymnasium_steps, in_process
 from codetr_ros.config import Settings, load
 from codetr_ros.records import Metrics, Policy, Record
+from codetr_ros.rewards import transformer
 from codetr_ros.simulator import Simulator
 from sac_gpu import device_facts
 
@@ -57,6 +61,7 @@ class Variant:
         changes: of the settings.
         gymnasium: whether Gymnasium steps its own environments.
         threads: of the simulator; None: as it finds.
+        cudnn: whether cuDNN may do the reward transformer's attention.
         once: in the first round only.
     """
 
@@ -65,6 +70,7 @@ class Variant:
     changes: dict[str, Any] = field(default_factory=dict)
     gymnasium: bool = False
     threads: int | None = None
+    cudnn: bool = False
     once: bool = False
 
 
@@ -72,8 +78,9 @@ def variants(device: str) -> list[Variant]:
     """All runs of a round."""
     there = {'device': device, 'reward_device': device, 'codetr.label_batch': 4096}
     here = {'device': 'cpu', 'reward_device': 'cpu', 'sac.compile': True}
-    short = {'steps': 3000, 'codetr.first_gradient_steps': 20}
-    long = there | {'steps': 10_000, 'evaluate_every': 0}
+    short = {'steps': 2000}
+    long = there | {'steps': 6000, 'evaluate_every': 0}
+    rounded = long | {'codetr.precision': 'bfloat16'}
     evaluated = there | {'steps': 10_000, 'evaluate_every': 5000}
     many = there | {'steps': 4000, 'evaluate_every': 0, 'envs': 8, 'codetr.gradient_steps': 1}
     found = [
@@ -81,8 +88,9 @@ def variants(device: str) -> list[Variant]:
         Variant('device', device, short | there),
         Variant('options', 'graph', long),
         Variant('options', 'compiled graph', long | {'sac.compile': device != 'cpu'}),
-        Variant('options', 'bfloat16', long | {'codetr.precision': 'bfloat16'}),
-        Variant('options', '256 labels at a time', long | {'codetr.label_batch': 256}),
+        Variant('options', 'bfloat16', rounded),
+        Variant('options', 'bfloat16, cuDNN', rounded, cudnn=True),
+        Variant('options', '256 segments at a time', long | {'codetr.label_batch': 256}),
         Variant('steps', 'ours', evaluated),
         Variant('steps', "Gymnasium's", evaluated, gymnasium=True),
     ]
@@ -95,7 +103,7 @@ def variants(device: str) -> list[Variant]:
 def settings_of(variant: Variant, smallest: bool) -> Settings:
     """The settings of a run."""
     usual = {'task': 'HalfCheetah-v5', 'warmup_steps': 1000, 'sac.compile': False}
-    changes = usual | {'codetr.first_gradient_steps': 100, **variant.changes}
+    changes = usual | {'codetr.first_gradient_steps': 10, **variant.changes}
     if smallest:
         changes |= {**SMALL, 'steps': 300, 'warmup_steps': 100, 'sac.compile': False}
         changes |= {'codetr.first_gradient_steps': 2, 'evaluate_episodes': 1}
@@ -158,15 +166,18 @@ class Watch:
 @contextmanager
 def switched(variant: Variant) -> Iterator[None]:
     """The library as a variant has it."""
-    ours = gymnasium_steps.stepper
+    ours, kernels = gymnasium_steps.stepper, list(transformer.KERNELS)
     if variant.gymnasium:
         gymnasium_steps.stepper = lambda env: None
+    if variant.cudnn:
+        transformer.KERNELS.append(SDPBackend.CUDNN_ATTENTION)
     if variant.threads:
         in_process.Simulator = partial(Simulator, threads=variant.threads)
     try:
         yield
     finally:
         gymnasium_steps.stepper = ours
+        transformer.KERNELS[:] = kernels
         in_process.Simulator = Simulator
 
 
@@ -229,7 +240,8 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument('--device', default='cuda')
-    parser.add_argument('--rounds', type=int, default=3)
+    parser.add_argument('--seconds', type=float, default=190, help='no round that would end later')
+    parser.add_argument('--rounds', type=int, default=5, help='at most')
     parser.add_argument('--groups', nargs='+', metavar='GROUP', help='those that begin so')
     parser.add_argument('--smallest', action='store_true', help='only show that it works')
     parser.add_argument('--out', type=Path, default=RESULTS)
@@ -241,10 +253,12 @@ def main() -> int:
         for variant in variants(device)
         if any(map(variant.group.startswith, arguments.groups or ['']))
     ]
+    began = time.monotonic()
     # does not count: what libraries set up at their first use
     one_run(Variant('', '', chosen[-1].changes), device, smallest=True)
     rows: list[dict[str, Any]] = []
     for n in range(1 if smallest else arguments.rounds):
+        before = time.monotonic()
         for variant in chosen[:: -1 if n % 2 else 1]:
             if n and variant.once:
                 continue
@@ -252,6 +266,9 @@ def main() -> int:
             rows.append({'group': variant.group, 'run': variant.name, 'round': n} | took)
             print(variant.group, variant.name, f'{took["seconds"]:.2f} s', flush=True)
             write(rows, facts, arguments.out)
+        now = time.monotonic()
+        if now - began + (now - before) > arguments.seconds:
+            break  # another round would take as long
     print('\n'.join(table(rows)))
     return 0
 

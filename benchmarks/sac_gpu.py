@@ -11,7 +11,8 @@ the sizes of Ant (27 or 105 observations, 8 actions) and HalfCheetah (17, 6):
 A round goes through all of them in turn, with as many updates as `--updates` says, from the first
 call until the GPU has done the last of them. The table gives the median round, and the lowest and
 highest in brackets. `phase` is what the host does between two phases of 1000 steps: it copies what
-is new and all labels, and finds out which steps are labelled.
+is new and all labels, and finds out which steps are labelled; `first` is the first time, with all
+of the memory and the recording; `made` is the making of a learner, compiling included.
 
 A profile of some updates follows, by the time that kernels take on the GPU: how many kernels an
 update has, and which ones take longest. Of replayed graphs profilers have been seen to miss or
@@ -104,12 +105,15 @@ class Run:
         )
 
 
-def forms(sizes: tuple[int, int], device: str, batch: int, width: int) -> dict[str, DeviceSAC]:
-    """The learners that are compared."""
+def forms(
+    sizes: tuple[int, int], device: str, batch: int, width: int
+) -> dict[str, tuple[DeviceSAC, float]]:
+    """The learners that are compared, and the seconds that making each has taken."""
 
-    def make(compiling: bool, **options: Any) -> DeviceSAC:
+    def make(compiling: bool, **options: Any) -> tuple[DeviceSAC, float]:
         settings = SacSettings(hidden=(width, width), batch=batch, compile=compiling)
-        return DeviceSAC(*sizes, settings, 0, device, **options)
+        began = time.perf_counter()
+        return DeviceSAC(*sizes, settings, 0, device, **options), time.perf_counter() - began
 
     made = {'eager': make(False, record=lambda call: call)}
     if device != 'cpu':
@@ -136,7 +140,8 @@ def measure(task: str, arguments: argparse.Namespace) -> tuple[list[dict[str, An
     device, updates = arguments.device, arguments.updates
     run = Run(SIZES[task], arguments.steps)
     rows, profiles = [], []
-    made = forms(SIZES[task], device, arguments.batch, arguments.width)
+    timed = forms(SIZES[task], device, arguments.batch, arguments.width)
+    made = {name: sac for name, (sac, _) in timed.items()}
     first = {
         name: seconds(lambda sac=sac: sac.take(run.memory), device) for name, sac in made.items()
     }
@@ -151,7 +156,7 @@ def measure(task: str, arguments: argparse.Namespace) -> tuple[list[dict[str, An
             rows.append(
                 {'task': task, 'form': name, 'round': n, 'updates': updates}
                 | {'seconds': round(took, 5), 'phase_s': round(phase, 5)}
-                | {'first_s': round(first[name], 2)}
+                | {'first_s': round(first[name], 2), 'made_s': round(timed[name][1], 2)}
             )
     for name, sac in made.items():
         kernels = profiled(lambda sac=sac: sac.replay(PROFILED), device, PROFILED)
@@ -189,8 +194,8 @@ def profiled(call: Callable[[], object], device: str, times: int) -> str:
 def table(rows: list[dict[str, Any]]) -> list[str]:
     """A line for each size and form."""
     lines = [
-        '| size | form | updates/s | of eager | phase [ms] | first [s] |',
-        '|---|---|---:|---:|---:|---:|',
+        '| size | form | updates/s | of eager | phase [ms] | first [s] | made [s] |',
+        '|---|---|---:|---:|---:|---:|---:|',
     ]
     eager: list[float] = []
     for task, form in dict.fromkeys((row['task'], row['form']) for row in rows):
@@ -201,7 +206,8 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
         phases = [1000 * row['phase_s'] for row in some]
         cells = [task, form, machine.spread(rates, '.0f'), machine.spread(ratios, '.2f')]
         cells.append(machine.spread(phases, '.1f'))
-        lines.append(f'| {" | ".join(cells)} | {some[0]["first_s"]:.1f} |')
+        cells += [f'{some[0][name]:.1f}' for name in ('first_s', 'made_s')]
+        lines.append(f'| {" | ".join(cells)} |')
     return lines
 
 
