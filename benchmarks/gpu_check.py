@@ -97,9 +97,9 @@ def steps(device: str, smallest: bool, out: Path) -> list[Step]:
         labels += ['--label-batches', '64', '256']
     else:
         train += ['--steps', '6000']
-        sac += ['--only', 'HalfCheetah', 'Ant 105', '--updates', '1000']
+        sac += ['--only', 'HalfCheetah', 'Ant 105', '--updates', '500']
         codetr += ['--delays', '25', '100']
-        labels += ['--label-batches', '256', '1024', '16384', '--part-mib', '128', '1024']
+        labels += ['--label-batches', '256', '16384', '--part-mib', '128', '1024']
     small = ['--smallest'] if smallest else []
     runs = ['gpu_runs.py', '--device', device, '--out', str(out), *small]
     profile = ['gpu_profile.py', '--device', device, '--out', str(out), *small]

@@ -240,7 +240,7 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument('--device', default='cuda')
-    parser.add_argument('--seconds', type=float, default=190, help='no round that would end later')
+    parser.add_argument('--seconds', type=float, default=205, help='no round that would end later')
     parser.add_argument('--rounds', type=int, default=5, help='at most')
     parser.add_argument('--groups', nargs='+', metavar='GROUP', help='those that begin so')
     parser.add_argument('--smallest', action='store_true', help='only show that it works')
