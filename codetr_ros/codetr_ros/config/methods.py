@@ -95,7 +95,7 @@ class CodetrSettings(Group):
         'float32',
         description="of the causal layers' products; weights and heads are float32 in any case. "
         'bfloat16 rounds to 8 bits, and is faster for large networks where the processor has it '
-        '(avx512_bf16, amx)',
+        '(avx512_bf16, amx); on a GPU it makes labels faster, gradient steps slower',
     )
 
     @model_validator(mode='after')
