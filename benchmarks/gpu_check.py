@@ -29,6 +29,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -144,9 +145,9 @@ def run(step: Step, seconds: float, out: Path) -> Outcome:
         except subprocess.TimeoutExpired:
             said = f'cut off after {limit:.0f} s'
         finally:
-            if process.poll() is None:
+            with suppress(ProcessLookupError):  # nothing that it has started is left
                 os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
+            process.wait()
     return Outcome(step, said, time.monotonic() - began)
 
 

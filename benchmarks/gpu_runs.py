@@ -14,7 +14,9 @@ as there is time for another. Groups:
     finds them faster, never, and always
 
 Columns: seconds from the first permission to simulate to the end, and of them what each stage
-took; `else` is messages, policies and checkpoints. `GPU busy` is the share of time in which the
+took; `else` is messages, policies and checkpoints. In process evaluation takes its turn between
+two gradient steps or bursts, so that `fit` and `update` hold some of its seconds a second time
+where a run is evaluated: `else` is left empty there. `GPU busy` is the share of time in which the
 driver saw a kernel run. The median round, and the lowest and highest in brackets.
 """
 
@@ -188,8 +190,8 @@ def one_run(variant: Variant, device: str, smallest: bool) -> dict[str, float | 
         reports = in_process.run(settings, 'run', Path(folder), watch.receive)
         row = watch.row()
     row['evaluate'] = reports['evaluate']['cpu_s']
-    used = sum(float(row[stage]) for stage in (*STAGES, 'evaluate'))
-    row['else'] = float(row['seconds']) - used
+    used = sum(float(row[stage]) for stage in STAGES)
+    row['else'] = '' if settings.evaluate_every else float(row['seconds']) - used
     return {'steps': settings.steps} | row
 
 
@@ -204,7 +206,9 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
     for group, name in dict.fromkeys((row['group'], row['run']) for row in rows):
         some = [row for row in rows if (row['group'], row['run']) == (group, name)]
         cells = [group, name, str(some[0]['steps'])]
-        cells += [machine.spread([row[column] for row in some], '.2f') for column in columns]
+        for column in columns:
+            values = [row[column] for row in some if row[column] != '']
+            cells.append(machine.spread(values, '.2f') if values else '')
         for stage, work, form in (
             ('fit', 'gradient_steps', '.1f'),
             ('update', 'updates', '.0f'),
