@@ -3,7 +3,7 @@
     .venv/bin/python benchmarks/gpu_check.py
 
 needs no ROS. The steps, each of which has a time limit of its own:
-  - tests: those of the device paths, `tests/test_device_*.py`, the slow ones included
+  - tests: those of the device paths, `tests/*/test_*device*.py`, the slow ones included
   - command: `codetr train --in-process --device cuda --reward-device cuda`, as people type it
   - sac: `sac_gpu.py`, updates per second: eager, replayed, compiled and replayed
   - codetr: `codetr_speed.py`, gradient steps and labels per second, in float32 and bfloat16
@@ -84,7 +84,7 @@ def steps(device: str, smallest: bool, out: Path) -> list[Step]:
         smallest: only show that the scripts work.
         out: the folder of the results.
     """
-    tests = sorted(map(str, TESTS.glob('test_device_*.py')))
+    tests = sorted(map(str, TESTS.glob('*/test_*device*.py')))
     pytest = ['-m', 'pytest', *tests, '-q', '-p', 'no:cacheprovider']
     train = ['-m', 'codetr_ros.cli', 'train', '--in-process', '--device', device]
     train += ['--reward-device', device, '--config', 'quick', '--out', str(out / 'logs' / 'run')]

@@ -19,8 +19,8 @@ import sys
 from pathlib import Path
 
 import machine
-from codetr_ros import in_process
 from codetr_ros.config import load
+from codetr_ros.cores import in_process
 from codetr_speed import Work
 from gpu_runs import RESULTS, Variant, one_run, settings_of, variants
 from sac_gpu import device_facts, profiled

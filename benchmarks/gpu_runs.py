@@ -9,9 +9,10 @@ as there is time for another. Groups:
   - device: 2000 steps on the CPU with one thread, after the first round only, and on the device
   - options: 6000 steps: SAC's graph, the same compiled before, bfloat16 (and with cuDNN's
     attention), 256 segments labelled at a time
-  - steps: 10 000 steps, evaluations included, by `codetr_ros.gymnasium_steps` or by Gymnasium
-  - threads: 4000 steps of eight environments in one simulator, in threads where the simulator
-    finds them faster, never, and always
+
+The recorded results have two groups more, of what they led to remove: steps of Gymnasium's
+environments without what nobody reads (`steps`), and threads for the environments of a simulator
+(`threads`). See docs/decisions.
 
 Columns: seconds from the first permission to simulate to the end, and of them what each stage
 took; `else` is messages, policies and checkpoints. In process evaluation takes its turn between
@@ -31,7 +32,6 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,11 +39,10 @@ import torch
 from torch.nn.attention import SDPBackend
 
 import machine
-from codetr_ros import gymnasium_steps, in_process
 from codetr_ros.config import Settings, load
+from codetr_ros.cores import in_process
 from codetr_ros.records import Metrics, Policy, Record
 from codetr_ros.rewards import transformer
-from codetr_ros.simulator import Simulator
 from sac_gpu import device_facts
 
 RESULTS = Path(__file__).parent / 'results' / 'gpu_check'
@@ -61,8 +60,6 @@ class Variant:
         group: with what it is compared.
         name: what is different about it.
         changes: of the settings.
-        gymnasium: whether Gymnasium steps its own environments.
-        threads: of the simulator; None: as it finds.
         cudnn: whether cuDNN may do the reward transformer's attention.
         once: after the first round only.
     """
@@ -70,8 +67,6 @@ class Variant:
     group: str
     name: str
     changes: dict[str, Any] = field(default_factory=dict)
-    gymnasium: bool = False
-    threads: int | None = None
     cudnn: bool = False
     once: bool = False
 
@@ -83,9 +78,7 @@ def variants(device: str) -> list[Variant]:
     short = {'steps': 2000}
     long = there | {'steps': 6000, 'evaluate_every': 0}
     rounded = long | {'codetr.precision': 'bfloat16'}
-    evaluated = there | {'steps': 10_000, 'evaluate_every': 5000}
-    many = there | {'steps': 4000, 'evaluate_every': 0, 'envs': 8, 'codetr.gradient_steps': 1}
-    found = [
+    return [
         Variant('device', 'CPU', short | here, once=True),
         Variant('device', device, short | there),
         Variant('options', 'graph', long),
@@ -93,13 +86,7 @@ def variants(device: str) -> list[Variant]:
         Variant('options', 'bfloat16', rounded),
         Variant('options', 'bfloat16, cuDNN', rounded, cudnn=True),
         Variant('options', '256 segments at a time', long | {'codetr.label_batch': 256}),
-        Variant('steps', 'ours', evaluated),
-        Variant('steps', "Gymnasium's", evaluated, gymnasium=True),
     ]
-    for task in ('HalfCheetah-v5', 'Humanoid-v5'):
-        for name, threads in (('as found', None), ('none', 1), ('always 8', 8)):
-            found.append(Variant(f'threads, {task}', name, many | {'task': task}, threads=threads))
-    return found
 
 
 def settings_of(variant: Variant, smallest: bool) -> Settings:
@@ -168,19 +155,13 @@ class Watch:
 @contextmanager
 def switched(variant: Variant) -> Iterator[None]:
     """The library as a variant has it."""
-    ours, kernels = gymnasium_steps.stepper, list(transformer.KERNELS)
-    if variant.gymnasium:
-        gymnasium_steps.stepper = lambda env: None
+    kernels = list(transformer.KERNELS)
     if variant.cudnn:
         transformer.KERNELS.append(SDPBackend.CUDNN_ATTENTION)
-    if variant.threads:
-        in_process.Simulator = partial(Simulator, threads=variant.threads)
     try:
         yield
     finally:
-        gymnasium_steps.stepper = ours
         transformer.KERNELS[:] = kernels
-        in_process.Simulator = Simulator
 
 
 def one_run(variant: Variant, device: str, smallest: bool) -> dict[str, float | str]:

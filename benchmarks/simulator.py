@@ -2,7 +2,7 @@
 
     .venv/bin/python benchmarks/simulator.py                    # on an idle machine
 
-Everything but threads is on one thread, and measured in rounds that go through all that is
+Everything is on one thread, and measured in rounds that go through all that is
 compared, in another order each time. A ratio is made of two measurements of one round; the tables
 give the median of the rounds, and the lowest and highest in brackets.
 
@@ -22,14 +22,8 @@ tasks:
     it
   - numpy: the same with numpy's products
 
-Threads, for HalfCheetah and Ant: a phase of a simulator with as many environments (`envs`) as
-there are cores, acting with such a policy, resets and records included:
-  - ours: as it comes, in threads or one environment after the other, whichever it finds faster
-  - threads: always in as many threads
-  - one thread: always one after the other
-
 `--clock cpu` counts the time that the processor worked for this process instead of the time on
-the wall: for a machine that does other things as well. Threads are always timed on the wall.
+the wall: for a machine that does other things as well.
 """
 
 import argparse
@@ -48,14 +42,12 @@ import torch
 
 import machine
 from codetr_ros.config import Settings
-from codetr_ros.cores.simulator import Simulator
 from codetr_ros.policy.acting import ActingPolicy, uniform_actions
-from codetr_ros.policy.actor import Actor, describe, linear_layers, weights_bytes
-from codetr_ros.records import F32, INITIAL_VERSION, Policy
+from codetr_ros.policy.actor import Actor, linear_layers
+from codetr_ros.records import F32
 from codetr_ros.seeding import generator
 from codetr_ros.simulation import tasks
 from codetr_ros.simulation.episode import Episode
-from codetr_ros.system import processors
 
 RESULTS = Path(__file__).parent / 'results'
 PACKAGES = ('mujoco', 'gymnasium', 'numpy', 'torch')
@@ -63,7 +55,6 @@ CLOCKS = {'wall': time.perf_counter, 'cpu': time.process_time}
 COLUMNS = ('what', 'task', 'name', 'round', 'calls', 'seconds')
 NAMES = [name for name, task in tasks.TASKS.items() if task.library == 'gymnasium']
 HIDDEN = (256, 256)
-THREADED = ('HalfCheetah-v5', 'Ant-v4')
 CALLS = 2000
 """Actions of a policy in a round."""
 
@@ -231,50 +222,6 @@ def action_rows(name: str, arguments: argparse.Namespace) -> list[dict[str, Any]
     return rows
 
 
-def thread_rows(name: str, arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """All rounds of a simulator with several environments."""
-    cores = processors.count()
-    settings = Settings(task=name, envs=cores)
-    environment = tasks.make(name)
-    sizes = environment.observation_size, environment.action_size
-    torch.manual_seed(0)
-    weights = weights_bytes(Actor(*sizes, HIDDEN))
-    run, sources = settings.run_spec('benchmark'), settings.sources_of('sim')
-    steps = np.full(cores, arguments.steps, np.uint32)
-    simulators = {
-        'ours': Simulator(run, settings, 'sim'),
-        'threads': Simulator(run, settings, 'sim', threads=cores),
-        'one thread': Simulator(run, settings, 'sim', threads=1),
-    }
-    works = {who: simulator.work() for who, simulator in simulators.items()}
-    for work in works.values():
-        next(work)  # what is simulated
-    rows = []
-    for number in range(-1, arguments.rounds):
-        phase = number + 1
-        policy = Policy(
-            run_id=run.run_id,
-            phase=phase,
-            version=INITIAL_VERSION,
-            sources=sources,
-            steps=steps,
-            random=False,
-            network=describe(*sizes, HIDDEN),
-            weights=weights,
-        )
-        seconds = {}
-        for who in turned(list(simulators), number):
-            simulators[who].receive(policy)
-            began = time.perf_counter()
-            while next(works[who]) is not None:
-                pass
-            seconds[who] = time.perf_counter() - began
-        rows += rows_of('threads', name, number, cores * arguments.steps, seconds)
-    for simulator in simulators.values():
-        simulator.close()
-    return rows
-
-
 def turned(names: list[str], number: int) -> list[str]:
     """Names, another one first in each round."""
     at = number % len(names)
@@ -299,11 +246,6 @@ def rows_of(
 TABLES = {
     'step': ('Steps', ('ours', 'floor', 'gymnasium'), ('floor', 'gymnasium')),
     'action': ('Actions, one observation at a time', ('ours', 'module', 'numpy'), ('module',)),
-    'threads': (
-        'Several environments: a step of any of them',
-        ('ours', 'threads', 'one thread'),
-        ('threads', 'one thread'),
-    ),
 }
 """For each kind of row: its title, whose times are shown, and what ours are compared with."""
 
@@ -368,8 +310,6 @@ def main() -> int:
         if arguments.only in name:
             print(name, file=sys.stderr, flush=True)
             rows += step_rows(name, arguments) + action_rows(name, arguments)
-            if name in THREADED:
-                rows += thread_rows(name, arguments)
     facts = {
         **machine.facts(load_at_start, PACKAGES),
         'rounds': f'{arguments.rounds}, of {arguments.steps} steps and {CALLS} actions',

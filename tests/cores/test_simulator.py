@@ -9,7 +9,7 @@ import torch
 
 from codetr_ros import records
 from codetr_ros.config import Settings, SettingsError
-from codetr_ros.cores.simulator import Simulator, ThreadChoice
+from codetr_ros.cores.simulator import Simulator
 from codetr_ros.policy.acting import ActingPolicy
 from codetr_ros.policy.actor import Actor, describe, weights_bytes
 from codetr_ros.records import (
@@ -48,9 +48,9 @@ def learnt(task, seed=0):
     return {'random': False, 'network': describe(*sizes, (16, 16)), 'weights': weights}
 
 
-def slices(settings: Settings, policies, source='sim', threads=None):
+def slices(settings: Settings, policies, source='sim'):
     """What a simulator yields, slice by slice, when it has the policies from the start."""
-    simulator = Simulator(run_spec(settings), settings, source, threads)
+    simulator = Simulator(run_spec(settings), settings, source)
     for each in policies:
         simulator.receive(each)
     out = []
@@ -369,40 +369,17 @@ def test_a_phase_in_which_only_others_have_steps_is_passed_over():
     assert [chunk.phase for chunk in kind(Transitions, said)] == [1]
 
 
-def several(task, envs, threads=None, phases=4):
+def several(task, envs, phases=4):
     """Slices of a simulator with some environments: two random phases, then two learnt ones."""
     settings = tiny(task=task, envs=envs, phase_steps=101 * envs)
     names = settings.sources_of('sim')
     policies = [permit(k, 101, names, **(learnt(task) if k > 1 else {})) for k in range(phases)]
-    return settings, slices(settings, policies, threads=threads)
-
-
-@pytest.mark.parametrize('task', [FALLS, NEVER_ENDS])
-def test_threads_change_no_bit_and_no_order(task):
-    _, alone = several(task, 3, threads=1)
-    _, together = several(task, 3, threads=3)
-    assert len(alone) == len(together)
-    for a, b in zip(alone, together, strict=True):
-        assert all(map(same, deterministic(a), deterministic(b)))
-        assert len(a) == len(b)
-
-
-def test_threads_are_used_where_they_are_faster_and_tried_again_now_and_then():
-    choice, cost, used = ThreadChoice(), {True: 3.0, False: 1.0}, []
-    for number in range(400):
-        if number == 200:  # from now on another policy acts, say
-            cost = {True: 1.0, False: 2.0}
-        used.append(choice.threads())
-        choice.note(used[-1], cost[used[-1]])
-    before, after = used[:200], used[200 + ThreadChoice.TRY_AGAIN :]
-    assert {True, False} == set(used[:2])
-    assert 0 < before.count(True) <= 200 / ThreadChoice.TRY_AGAIN + 2
-    assert 0 < after.count(False) <= len(after) / ThreadChoice.TRY_AGAIN + 2
+    return settings, slices(settings, policies)
 
 
 @pytest.mark.parametrize('task', [FALLS, NEVER_ENDS])
 def test_each_environment_is_the_source_that_a_simulator_of_its_name_would_be(task):
-    settings, said = several(task, 3, threads=2)
+    settings, said = several(task, 3)
     names = settings.sources_of('sim')
     assert names == ('sim-1', 'sim-2', 'sim-3')
     own = settings.changed({'envs': 1, 'simulators': 3})

@@ -87,8 +87,7 @@ class Settings(Group):
         1,
         ge=1,
         le=64,
-        description='environments of each simulator, among which its steps are divided; they are '
-        'stepped in threads, as many as there are processors, where that is faster',
+        description='environments of each simulator, among which its steps are divided',
     )
     memory_steps: int = Field(
         1_000_000, ge=1, le=10**9, description='steps that the memory D holds'

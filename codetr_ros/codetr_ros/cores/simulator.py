@@ -3,10 +3,7 @@
 import time
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
-
-import torch
 
 from codetr_ros.config import Settings
 from codetr_ros.policy.acting import ActingPolicy
@@ -22,7 +19,6 @@ from codetr_ros.records import (
 )
 from codetr_ros.simulation.permission import acting_policy, check_policy
 from codetr_ros.simulation.source import Source
-from codetr_ros.system import processors
 
 
 class Simulator:
@@ -33,19 +29,14 @@ class Simulator:
     have. Whoever receives, keeps, verifies or plays steps therefore need not know which process
     they come from, and the memory D has one open episode for each source, as ever. What the
     environments have in common is the process, the policy and the turn: a slice is one chunk of
-    each, one after the other in the order of their names.
-
-    Their chunks are rolled out in threads, as many as there are processors, where that is faster:
-    MuJoCo releases the interpreter lock while it steps, and PyTorch while it multiplies, but where
-    their parts are short threads wait for each other. No source shares with another anything that
-    changes, so that threads change no bit.
+    each, one after the other in the order of their names. Threads do not pay: the parts of a step
+    that release the interpreter lock are too short (measured with eight environments and 16 cores,
+    docs/decisions).
 
     Args:
         run: the run it belongs to.
         settings: the settings of the run.
         name: its name, which must differ from every other simulator's of the run.
-        threads: how many, always; where None as many as there are processors, or none, whichever
-            is faster.
 
     Raises:
         TaskError: the task is unknown or cannot be used.
@@ -54,9 +45,7 @@ class Simulator:
 
     subscribes: tuple[type, ...] = (Policy,)
 
-    def __init__(
-        self, run: RunSpec, settings: Settings, name: str, threads: int | None = None
-    ) -> None:
+    def __init__(self, run: RunSpec, settings: Settings, name: str) -> None:
         self._run = run
         self._settings = settings
         self._name = name
@@ -66,14 +55,6 @@ class Simulator:
         self._counters: Counter[str] = Counter()
         self._closed = False
         self.finished = False
-        workers = min(len(self._sources), threads or processors.count())
-        self._pool = (
-            # torch keeps its number of threads for each thread that calls it
-            ThreadPoolExecutor(workers, 'env', torch.set_num_threads, (settings.threads,))
-            if workers > 1
-            else None
-        )
-        self._choice = ThreadChoice() if self._pool is not None and threads is None else None
 
     def receive(self, record: Record) -> None:
         """Keep a policy until its phase's turn.
@@ -128,31 +109,19 @@ class Simulator:
         ]
         seconds = 0.0
         while going:
-            chunks, spent = self._chunks(going)
-            seconds += spent
+            began = time.perf_counter()
+            chunks = [next(rollout) for rollout in going]
+            seconds += time.perf_counter() - began
             going = [
                 rollout
-                for rollout, said in zip(going, chunks, strict=True)
-                if not _chunk(said).phase_end
+                for rollout, records in zip(going, chunks, strict=True)
+                if not _transitions(records).phase_end
             ]
-            records = [record for said in chunks for record in said]
+            records = [record for chunk in chunks for record in chunk]
             if not going:
                 self._counters['phases'] += 1
                 records.append(self._metrics(policy.phase, seconds))
             yield records
-
-    def _chunks(self, going: list[Iterator[list[Record]]]) -> tuple[list[list[Record]], float]:
-        """The next records of each, in order, and the seconds that they took."""
-        several = len(going) > 1
-        choice = self._choice if several else None
-        threads = several if choice is None else choice.threads()
-        pool = self._pool if threads else None
-        began = time.perf_counter()
-        chunks = list(map(next, going) if pool is None else pool.map(next, going))
-        spent = time.perf_counter() - began
-        if choice is not None:
-            choice.note(threads, spent / sum(_chunk(said).steps for said in chunks))
-        return chunks, spent
 
     def _metrics(self, phase: int, seconds: float) -> Metrics:
         step = self._settings.steps_after(phase)
@@ -163,8 +132,6 @@ class Simulator:
         """Close the environments. A simulator keeps no checkpoint."""
         if not self._closed:
             self._closed = True
-            if self._pool is not None:
-                self._pool.shutdown()
             for source in self._sources:
                 source.close()
 
@@ -176,30 +143,8 @@ class Simulator:
         return {'lost': {}, 'duplicated': {}, 'counters': dict(counters)}
 
 
-class ThreadChoice:
-    """Whether to use threads: whatever was faster when it was last tried, and now and then the
-    other, since what is faster changes with the policy and with what else the machine does.
-    """
-
-    TRY_AGAIN = 32  # slices
-
-    def __init__(self) -> None:
-        self._seconds = {True: 0.0, False: 0.0}  # per step, by threads or none; 0: to be tried
-        self._slices = 0
-
-    def threads(self) -> bool:
-        """Whether the next slice is to use them."""
-        self._slices += 1
-        faster = self._seconds[True] <= self._seconds[False]
-        return faster != (self._slices % self.TRY_AGAIN == 0)
-
-    def note(self, threads: bool, seconds: float) -> None:
-        """Keep how many seconds a step has taken, with threads or without."""
-        self._seconds[threads] = seconds
-
-
-def _chunk(said: list[Record]) -> Transitions:
-    """The chunk among what a source said: the first record."""
-    chunk = said[0]
-    assert isinstance(chunk, Transitions)
-    return chunk
+def _transitions(records: list[Record]) -> Transitions:
+    """The transitions among the records of a chunk: the first of them."""
+    first = records[0]
+    assert isinstance(first, Transitions)
+    return first

@@ -140,7 +140,8 @@ class CausalTransformer(nn.Module):
             h = h * keep_mask(h.shape, self.dropout, h.device)
         *others, last = self.blocks
         rounded = torch.autocast(h.device.type, torch.bfloat16) if self.rounded else nullcontext()
-        with rounded, sdpa_kernel(KERNELS):
+        attending = sdpa_kernel(KERNELS) if h.is_cuda else nullcontext()
+        with rounded, attending:
             for block in others:
                 h = block(h)
             h = last(h, 2 if self.pair else 1)

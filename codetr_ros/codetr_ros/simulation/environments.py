@@ -161,8 +161,6 @@ class GymnasiumEnvironment(Environment):
     def __init__(self, task: Task) -> None:
         import gymnasium
 
-        from codetr_ros.simulation.fast_steps import stepper
-
         try:
             with _quiet():
                 # no checker, no time limit and no order enforcer: they would cost more than some
@@ -188,14 +186,11 @@ class GymnasiumEnvironment(Environment):
         box = spaces['action']
         size = math.prod(spaces['observation'].shape)
         super().__init__(task, size, box.low, box.high, _period(self._env))
-        self._stepper = stepper(self._env)
 
     def _reset(self, seed: int) -> F32:
         return _own(self._env.reset(seed=seed)[0])
 
     def _step(self, action: NDArray[Any]) -> tuple[F32, float, bool]:
-        if self._stepper is not None:
-            return self._stepper.step(action)
         shaped = action.reshape(self._env.action_space.shape)
         observation, reward, terminated, truncated, _ = self._env.step(shaped)
         if truncated and self._steps < self.horizon:
