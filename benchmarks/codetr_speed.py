@@ -110,7 +110,7 @@ class Work:
         self.model = Codetr(settings, OBSERVATION, ACTION)
         self.model.prepare(self.memory)
         segments = max(LABELLED // settings.delay, 64)
-        ids = self.memory.segment_ids()
+        ids = self.memory.segments.ids()
         self.ids = ids[:segments] if on_cpu else ids
         self.steps = 0
 

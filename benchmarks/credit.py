@@ -39,7 +39,7 @@ def measure(run: Path, data: dict[str, np.ndarray]) -> dict[str, object]:
     method = saved.restore(model, model.settings, *model.sizes)
     assert isinstance(method, Codetr), f'{run} is a run of method {model.settings.method}'
     _, held_out = reward_recovery.memories(data, model.settings)
-    batch = held_out.segment_batch(held_out.segment_ids(), method.context)
+    batch = held_out.segments.batch(held_out.segments.ids(), method.context)
     assert batch.true_rewards is not None
     weights, rewards = method.components(batch)
     labels, true = weights * rewards, batch.true_rewards

@@ -121,13 +121,13 @@ def work(role: str, observation: int, steps: int) -> dict[str, Any]:
         model.prepare(memory)
         for _ in range(2):
             model.gradient_step(memory, rng)
-        ids = memory.segment_ids()
+        ids = memory.segments.ids()
         for first in range(0, 2560, model.label_batch):
             for _ in model.label_passes(memory, ids[first : first + model.label_batch]):
                 pass
     else:
         sac = FlatSAC(observation, ACTION, settings.sac, 0)
-        sac.burst(settings.sac.burst, lambda rows: memory.sample_steps(rng, rows))
+        sac.burst(settings.sac.burst, lambda rows: memory.labelled.sample(rng, rows))
     return {
         'bare_mib': round(bare),
         'own_mib': round(memory.bytes_per_step * steps / MIB),

@@ -183,7 +183,7 @@ def measure(
     for i in range(gradient_steps):
         seed_torch(settings.seed, 'recovery', i)
         method.gradient_step(train, generator(settings.seed, 'recovery', i))
-    batch = held_out.segment_batch(held_out.segment_ids(), method.context)
+    batch = held_out.segments.batch(held_out.segments.ids(), method.context)
     assert batch.true_rewards is not None
     inside = segment_steps(batch)
     predicts, attends = isinstance(method, Learned), isinstance(method, Codetr)

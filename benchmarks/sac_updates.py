@@ -149,7 +149,7 @@ def ours(form: str, size: Size) -> Callable[[int], None]:
 
         def one_by_one(updates: int) -> None:
             for _ in range(updates):
-                plain.update(memory.sample_steps(rng, size.batch))
+                plain.update(memory.labelled.sample(rng, size.batch))
 
         return one_by_one
     flat = FlatSAC(size.observation, size.action, settings, 0)
@@ -157,7 +157,7 @@ def ours(form: str, size: Size) -> Callable[[int], None]:
     def bursts(updates: int) -> None:
         for first in range(0, updates, BURST):
             count = min(BURST, updates - first)
-            flat.burst(count, lambda rows: memory.sample_steps(rng, rows))
+            flat.burst(count, lambda rows: memory.labelled.sample(rng, rows))
 
     return bursts
 

@@ -137,7 +137,7 @@ class Parts:
 
     def update(self, sac: FlatSAC, settings: Settings) -> int:
         """Some SAC updates; how many."""
-        sac.burst(settings.sac.burst, lambda rows: self.memory.sample_steps(self.rng, rows))
+        sac.burst(settings.sac.burst, lambda rows: self.memory.labelled.sample(self.rng, rows))
         return settings.sac.burst
 
     def gradient_step(self) -> int:
@@ -147,8 +147,8 @@ class Parts:
 
     def label(self) -> int:
         """Label some segments; how many steps they have."""
-        ids = self.memory.segment_ids()[: self.settings.codetr.label_batch]
-        batch = self.memory.segment_batch(ids, self.method.context)
+        ids = self.memory.segments.ids()[: self.settings.codetr.label_batch]
+        batch = self.memory.segments.batch(ids, self.method.context)
         return len(self.method.label(batch)[segment_steps(batch)])
 
 

@@ -126,7 +126,9 @@ def test_a_bag_becomes_the_memory_that_the_run_had(tmp_path):
         for record in source:
             if isinstance(record, Transitions):
                 memory.append(record)
-    assert all(map(np.array_equal, live.observation_moments(), again.observation_moments()))
+    assert all(
+        map(np.array_equal, live.store.observation_moments(), again.store.observation_moments())
+    )
 
 
 def test_arrays_are_writeable_memory_of_our_own(tmp_path):

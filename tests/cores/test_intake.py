@@ -113,7 +113,7 @@ def test_the_order_of_arrival_does_not_matter():
         for record in (*arrival, commit(transitions=last(1), scores=last(0)), task_spec()):
             it.receive(record)
         assert it.take(0, m)
-        memories.append(m.segment_batch(m.segment_ids()))
+        memories.append(m.segments.batch(m.segments.ids()))
     for other in memories[1:]:
         np.testing.assert_array_equal(other.observations, memories[0].observations)
 
@@ -143,7 +143,7 @@ def test_a_score_for_no_segment_is_left_out_counted_and_said(caplog):
     it.receive(score(first_step=7))
     it.receive(commit(scores=last(0)))
     assert it.take(0, m)
-    assert it.refused == {'composite_rewards': 1} and len(m.segment_ids()) == 0
+    assert it.refused == {'composite_rewards': 1} and len(m.segments.ids()) == 0
     assert 'there is no such segment' in caplog.text
 
 
@@ -156,4 +156,4 @@ def test_records_of_several_sources_enter_in_the_order_of_their_names():
     m = memory()
     zero = np.zeros(2, np.int64)
     it.receive(replace(commit(), sources=('b', 'a'), transitions=zero))
-    assert it.take(0, m) and list(m.labels()) == ['a', 'b']
+    assert it.take(0, m) and list(m.labelled.by_source()) == ['a', 'b']

@@ -67,7 +67,7 @@ def trained(method: Learned, data: Trajectories, steps: int) -> Learned:
 
 def recovery(method: Learned, data: Trajectories) -> float:
     """Correlation of inferred and true rewards with each segment's mean removed."""
-    batch = data.segment_batch(data.segment_ids(), method.context)
+    batch = data.segments.batch(data.segments.ids(), method.context)
     inside = segment_steps(batch)
     true = linear(batch.observations[:, :-1].astype(np.float64), batch.actions.astype(np.float64))
     labels = method.label(batch).astype(np.float64)
@@ -78,7 +78,7 @@ def recovery(method: Learned, data: Trajectories) -> float:
 
 def explained(method: Learned, data: Trajectories) -> float:
     """R^2 of the predicted composite rewards."""
-    batch = data.segment_batch(data.segment_ids(), method.context)
+    batch = data.segments.batch(data.segments.ids(), method.context)
     residual = method.predict(batch) - batch.values
     return float(1 - np.mean(residual**2) / np.var(batch.values))
 

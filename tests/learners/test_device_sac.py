@@ -65,11 +65,11 @@ def test_a_hundred_updates_from_the_same_steps_and_noise_end_where_those_of_flat
     flat, sac = FlatSAC(*SIZES, settings(), 0), make(device)
     assert same(flat.state(), sac.state())
     assert sac.take(memory)
-    ring = memory.sources[0]
+    ring = memory.store.sources[0]
     rng = np.random.default_rng(0)
     for _ in range(100):
         slots = rng.integers(0, ring.end, 32)
-        steps = memory.steps_in(ring, slots)
+        steps = ring.steps_in(slots)
         noise = torch.randn(2, 32, ACTION)
         going_on = flat.discount * (1 - torch.tensor(steps.terminated, dtype=torch.float32))
         s, a, r, s2 = map(
@@ -234,7 +234,7 @@ def test_replays_follow_what_comes_labels_that_change_and_what_is_evicted():
     for phase in range(6):
         run.steps(20, end='terminated')
         run.memory.evict()
-        for number in run.memory.sources[0].by_number:
+        for number in run.memory.store.sources[0].by_number:
             run.label('sim', number, 0, 15)
         for sac in (eager, recorded):
             sac.take(run.memory)

@@ -134,7 +134,7 @@ def memory() -> tuple[Trajectories, list]:
 
 def test_the_newest_steps_carry_the_scores_of_segments_that_end_among_them() -> None:
     held, chunks = memory()
-    steps = held.newest([9])
+    steps = held.store.newest([9])
     assert np.array_equal(
         steps.observations, np.concatenate([c.observations[:-1] for c in chunks[1:]])
     )
@@ -144,13 +144,13 @@ def test_the_newest_steps_carry_the_scores_of_segments_that_end_among_them() -> 
     assert steps.rewards.tolist() == [0, 2, 0, 3, 0, 0, 0, 4, 0]
     assert np.flatnonzero(steps.terminated).tolist() == [3]
     assert np.flatnonzero(steps.last).tolist() == [3, 8]
-    assert len(held.newest([100]).rewards) == 15
+    assert len(held.store.newest([100]).rewards) == 15
 
 
 def test_the_newest_steps_of_several_sources_follow_one_after_the_other() -> None:
     held, _ = memory()
     held.append(transitions(source='a', steps=3))
-    steps = held.newest([2, 3])
+    steps = held.store.newest([2, 3])
     assert np.array_equal(steps.actions[:2], transitions(steps=3).actions[1:])
     assert steps.rewards.tolist() == [0, 0, 0, 4, 0]
     assert np.flatnonzero(steps.last).tolist() == [1, 4]

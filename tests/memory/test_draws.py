@@ -11,6 +11,7 @@ from codetr_ros.cores.labeller import Labeller
 from codetr_ros.cores.learner import Learner
 from codetr_ros.memory import draws
 from codetr_ros.memory.batches import StepBatch
+from codetr_ros.memory.labelled import LabelledSteps
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import Metrics, Record, StepRewards
 from helpers.builders import tiny
@@ -62,16 +63,16 @@ class Watched:
         self.places: list[set[int]] = []  # drawn, by phase
         self.told: list[set[int]] = []  # that the reward side knew of
         self.memories: dict[str, list[tuple[bytes, ...]]] = {'learner': [], 'reward': []}
-        sample, learn, label = Trajectories.sample_steps, Learner._learn, Labeller._label
+        sample, learn, label = LabelledSteps.sample, Learner._learn, Labeller._label
         told = draws.drawn
 
-        def sample_steps(memory: Trajectories, rng: Any, batch: int) -> StepBatch:
+        def sample_steps(steps: LabelledSteps, rng: Any, batch: int) -> StepBatch:
             again = np.random.Generator(type(rng.bit_generator)())
             again.bit_generator.state = rng.bit_generator.state
-            places = again.integers(0, memory.labelled_steps, batch)
+            places = again.integers(0, steps.count, batch)
             self.places[-1].update(places.tolist())
-            self.versions.append(set(memory.label_versions()[places].tolist()))
-            return sample(memory, rng, batch)
+            self.versions.append(set(steps.versions()[places].tolist()))
+            return sample(steps, rng, batch)
 
         def learning(core: Learner, phase: int, memory: Trajectories, learns: bool) -> Any:
             self.places.append(set())
@@ -87,14 +88,14 @@ class Watched:
             self.told.append(set(found.tolist()))
             return found
 
-        monkeypatch.setattr(Trajectories, 'sample_steps', sample_steps)
+        monkeypatch.setattr(LabelledSteps, 'sample', sample_steps)
         monkeypatch.setattr(Learner, '_learn', learning)
         monkeypatch.setattr(Labeller, '_label', labelling)
         monkeypatch.setattr(draws, 'drawn', drawn)
 
     def _note(self, side: str, memory: Trajectories) -> None:
-        labels = [part.tobytes() for _, part in sorted(memory.labels().items())]
-        self.memories[side].append((*labels, memory.label_versions().tobytes()))
+        labels = [part.tobytes() for _, part in sorted(memory.labelled.by_source().items())]
+        self.memories[side].append((*labels, memory.labelled.versions().tobytes()))
 
 
 @pytest.mark.parametrize(

@@ -22,9 +22,9 @@ def mirror(run: Run, device: str = 'cpu') -> DeviceMemory:
 def check(steps: DeviceMemory, run: Run) -> None:
     """Every step that is held lies in its row, and exactly the labelled ones can be drawn."""
     offset, labelled = 0, []
-    for ring in run.memory.sources:
+    for ring in run.memory.store.sources:
         slots = np.arange(ring.start, ring.end) % ring.capacity
-        held = run.memory.steps_in(ring, slots)
+        held = ring.steps_in(slots)
         s, a, r, s2, going_on = (
             part.cpu().numpy()
             for part in steps.read(torch.from_numpy(slots + offset).to(steps.rows.device))
@@ -54,12 +54,12 @@ def test_it_follows_steps_labels_relabels_evictions_and_a_ring_that_wraps(
         run.steps(9, end='terminated')
         run.steps(7, end='truncated' if phase % 2 else '')
         run.memory.evict()
-        for number, episode in run.memory.sources[0].by_number.items():
+        for number, episode in run.memory.store.sources[0].by_number.items():
             if phase % 3 or number % 2:
                 run.label('sim', number, 0, min(8, episode.steps))
         assert steps.update() == (phase > 0)
         check(steps, run)
-    assert run.memory.sources[0].start > run.memory.sources[0].capacity
+    assert run.memory.store.sources[0].start > run.memory.store.sources[0].capacity
 
 
 @pytest.mark.parametrize('device', DEVICES)
@@ -71,7 +71,7 @@ def test_it_follows_several_sources_and_one_that_appears_later(device):
         for name in names:
             run.steps(10, name, 'truncated')
         run.memory.evict()
-        for ring in run.memory.sources:
+        for ring in run.memory.store.sources:
             for number in ring.by_number:
                 run.label(ring.name, number, 2, 5)
         assert steps.update() == (phase not in {0, 3})  # rows move when a source appears
@@ -124,7 +124,7 @@ def test_the_same_seed_draws_the_same_steps_and_the_next_draw_others():
 def test_a_device_without_room_says_how_much_is_wanted_and_what_to_lower():
     run = Run()
     run.filled()
-    for ring in run.memory.sources:
+    for ring in run.memory.store.sources:
         ring.capacity = 1 << 50
     message = r'device=cpu: no room for \d{16} steps of \d+ bytes.* lower memory_steps'
     with pytest.raises(DeviceError, match=message):

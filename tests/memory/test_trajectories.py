@@ -5,7 +5,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from codetr_ros.memory import trajectories
+from codetr_ros.memory import store
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import CompositeReward, RecordError, StepRewards, Transitions
 from helpers import builders
@@ -138,8 +138,8 @@ def test_every_sampled_step_is_one_that_was_put_in_with_its_own_label(sources, c
                 last and episode['terminated'],
                 truth[source, number, t],
             )
-    assert m.steps <= capacity and m.labelled_steps == m.steps
-    batch = m.sample_steps(np.random.default_rng(0), 6000)
+    assert m.steps <= capacity and m.labelled.count == m.steps
+    batch = m.labelled.sample(np.random.default_rng(0), 6000)
     seen = set()
     for i in range(6000):
         key = batch.observations[i].tobytes()
@@ -154,10 +154,10 @@ def test_every_sampled_step_is_one_that_was_put_in_with_its_own_label(sources, c
 @pytest.mark.parametrize('context', [0, 5])
 def test_a_segment_batch_holds_the_steps_of_its_episode_and_zeros_beyond(context):
     m, naive, _ = filled(5, ('a', 'b'), episodes=9)
-    ids = m.segment_ids()
-    batch = m.segment_batch(ids, context)
+    ids = m.segments.ids()
+    batch = m.segments.batch(ids, context)
     at = 0
-    for source, numbers, firsts, lengths in m.segments(ids):
+    for source, numbers, firsts, lengths in m.segments.spans(ids):
         for number, first, length in zip(numbers, firsts, lengths, strict=True):
             episode = naive.episodes[source, int(number)]
             before = min(context, int(first))
@@ -175,14 +175,14 @@ def test_a_segment_batch_holds_the_steps_of_its_episode_and_zeros_beyond(context
 
 def test_windows_end_with_each_step_and_say_what_precedes_its_segment():
     m, naive, _ = filled(7, episodes=5)
-    ids, window = m.segment_ids(), 6
-    rows = list(m.windows(ids, window, 7))
+    ids, window = m.segments.ids(), 6
+    rows = list(m.segments.windows(ids, window, 7))
     observations = [
         b.observations[i, : b.lengths[i] + 1] for b in rows for i in range(len(b.lengths))
     ]
     contexts = [c for b in rows for c in b.context.tolist()]
     at = 0
-    for source, numbers, firsts, lengths in m.segments(ids):
+    for source, numbers, firsts, lengths in m.segments.spans(ids):
         for number, first, length in zip(
             numbers.tolist(), firsts.tolist(), lengths.tolist(), strict=True
         ):
@@ -199,13 +199,13 @@ def test_windows_end_with_each_step_and_say_what_precedes_its_segment():
 @pytest.mark.parametrize('capacity', [1000, 30])
 def test_steps_that_are_drawn_are_found_in_their_segments(sources, capacity):
     m, _, truth = filled(3, sources, episodes=25, capacity=capacity)
-    places, firsts = np.unique(m.draw(np.random.default_rng(1), 20), return_index=True)
-    drawn = m.sample_steps(np.random.default_rng(1), 20).rewards[firsts]
+    places, firsts = np.unique(m.labelled.draw(np.random.default_rng(1), 20), return_index=True)
+    drawn = m.labelled.sample(np.random.default_rng(1), 20).rewards[firsts]
 
-    ids, within = m.located(places)
+    ids, within = m.labelled.located(places)
     spans = [
         (source, episode, first + i, length)
-        for source, *columns in m.pieces(ids, within)
+        for source, *columns in m.segments.step_spans(ids, within)
         for episode, first, length in zip(*(c.tolist() for c in columns), strict=True)
         for i in range(length)
     ]
@@ -219,12 +219,14 @@ def test_steps_that_are_drawn_are_found_in_their_segments(sources, capacity):
 
 def test_a_step_has_the_same_window_alone_as_with_its_segment():
     m, _, _ = filled(7, episodes=5)
-    ids, window = m.segment_ids(), 6
+    ids, window = m.segments.ids(), 6
     whole = [
-        b.part(slice(i, i + 1)) for b in m.windows(ids, window, 7) for i in range(len(b.lengths))
+        b.part(slice(i, i + 1))
+        for b in m.segments.windows(ids, window, 7)
+        for i in range(len(b.lengths))
     ]
-    places = np.arange(1, m.labelled_steps, 3)
-    chosen = m.step_windows(*m.located(places), window, 5)
+    places = np.arange(1, m.labelled.count, 3)
+    chosen = m.segments.step_windows(*m.labelled.located(places), window, 5)
     single = [b.part(slice(i, i + 1)) for b in chosen for i in range(len(b.lengths))]
     for place, one in zip(places.tolist(), single, strict=True):
         other, steps = whole[place], int(one.lengths[0])
@@ -240,11 +242,13 @@ def test_labels_tell_which_version_gave_them():
     m.append(naive.chunk('sim', 10))
     for first in (4, 0):  # scored in another order
         m.score(score('sim', 0, first, DELAY))
-    assert m.label_versions().tolist() == [] and m.versions(m.segment_ids()).tolist() == [-1, -1]
+    assert m.labelled.versions().tolist() == [] and m.segments.versions(
+        m.segments.ids()
+    ).tolist() == [-1, -1]
     m.apply(labels('sim', [(0, 0, 4), (0, 4, 4)], np.ones(8), version=2))
     m.apply(labels('sim', [(0, 3, 2)], np.ones(2), version=5))
-    assert m.label_versions().tolist() == [2, 2, 2, 5, 5, 2, 2, 2]
-    assert m.versions(m.segment_ids()).tolist() == [5, 2]
+    assert m.labelled.versions().tolist() == [2, 2, 2, 5, 5, 2, 2, 2]
+    assert m.segments.versions(m.segments.ids()).tolist() == [5, 2]
 
 
 def test_the_oldest_whole_episodes_leave_first_and_an_unfinished_one_stays():
@@ -255,7 +259,7 @@ def test_the_oldest_whole_episodes_leave_first_and_an_unfinished_one_stays():
     m.score(score('sim', 0, 0, DELAY))
     m.score(score('sim', 1, 0, DELAY))
     assert m.evict() == 6 and m.steps == 8 and m.evicted == 6
-    assert [numbers.tolist() for _, numbers, _, _ in m.segments(m.segment_ids())] == [[1]]
+    assert [numbers.tolist() for _, numbers, _, _ in m.segments.spans(m.segments.ids())] == [[1]]
     m.append(naive.chunk('sim', 9, 'truncated'))
     assert (
         m.evict() == 5 and m.steps == 12
@@ -266,10 +270,10 @@ def test_steps_without_a_label_are_never_sampled():
     naive, m = Naive(0), memory()
     m.append(naive.chunk('sim', 6))
     with pytest.raises(ValueError, match='no step of the memory is labelled'):
-        m.sample_steps(np.random.default_rng(0), 1)
+        m.labelled.sample(np.random.default_rng(0), 1)
     m.apply(labels('sim', [(0, 0, DELAY)], np.arange(DELAY)))
-    assert m.labelled_steps == DELAY
-    assert set(m.sample_steps(np.random.default_rng(0), 200).rewards.tolist()) == {
+    assert m.labelled.count == DELAY
+    assert set(m.labelled.sample(np.random.default_rng(0), 200).rewards.tolist()) == {
         0.0,
         1.0,
         2.0,
@@ -283,7 +287,7 @@ def test_labels_of_evicted_episodes_are_counted_and_passed_over():
     m.append(naive.chunk('sim', 4, 'truncated'))
     m.evict()
     assert m.apply(labels('sim', [(0, 0, 4), (1, 0, 4)], np.arange(8))) == 4
-    assert sorted(m.sample_steps(np.random.default_rng(0), 99).rewards.tolist())[0] == 4.0
+    assert sorted(m.labelled.sample(np.random.default_rng(0), 99).rewards.tolist())[0] == 4.0
 
 
 @pytest.mark.parametrize(
@@ -305,7 +309,7 @@ def test_a_score_for_a_segment_that_does_not_exist_or_again_is_refused_and_chang
     m.score(score('sim', 0, 0, DELAY, 1.5))
     with pytest.raises(RecordError, match=said):
         m.score(wrong)
-    assert m.segment_batch(m.segment_ids()).values.tolist() == [1.5]
+    assert m.segments.batch(m.segments.ids()).values.tolist() == [1.5]
 
 
 def test_a_short_segment_counts_only_at_the_end_of_an_ended_episode():
@@ -315,7 +319,7 @@ def test_a_short_segment_counts_only_at_the_end_of_an_ended_episode():
         m.score(score('sim', 0, DELAY, 2))
     m.append(naive.chunk('sim', 1, 'terminated'))
     m.score(score('sim', 0, DELAY, 3))
-    assert len(m.segment_ids()) == 1
+    assert len(m.segments.ids()) == 1
 
 
 def test_steps_that_do_not_follow_on_are_refused_and_change_nothing():
@@ -341,10 +345,12 @@ def test_steps_whose_first_observation_is_another_are_refused():
 
 def test_the_scale_and_the_moments_are_those_of_what_is_held():
     m, naive, _ = filled(11, episodes=8)
-    batch = m.segment_batch(m.segment_ids())
-    assert m.score_scale() == pytest.approx(np.sqrt(np.mean((batch.values / batch.lengths) ** 2)))
+    batch = m.segments.batch(m.segments.ids())
+    assert m.segments.score_scale() == pytest.approx(
+        np.sqrt(np.mean((batch.values / batch.lengths) ** 2))
+    )
     before = np.concatenate([e['observations'][:-1] for e in naive.episodes.values()])
-    mean, deviation = m.observation_moments()
+    mean, deviation = m.store.observation_moments()
     np.testing.assert_allclose(mean, before.mean(0), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(deviation, before.std(0), rtol=1e-5)
 
@@ -358,12 +364,12 @@ def test_the_memory_takes_the_bytes_it_states():
 
 def test_moments_are_those_of_all_rows_at_once_however_they_are_read(monkeypatch):
     m, *_ = filled(4, ('a', 'b'), episodes=12, capacity=60)
-    parts = [s.observations[np.arange(s.start, s.end) % s.capacity] for s in m._sources.values()]
+    parts = [s.observations[np.arange(s.start, s.end) % s.capacity] for s in m.store.sources]
     rows = np.concatenate(parts).astype(np.float64)
     assert len(rows) > 21
     for size in (1, 7, 1000):
-        monkeypatch.setattr(trajectories, '_PART_ROWS', size)
-        mean, deviation = m.observation_moments()
+        monkeypatch.setattr(store, 'PART_ROWS', size)
+        mean, deviation = m.store.observation_moments()
         np.testing.assert_array_equal(mean, rows.mean(0))
         np.testing.assert_array_equal(deviation, rows.std(0))
 
@@ -413,9 +419,9 @@ def test_a_step_of_ant_takes_at_most_a_tenth_more_than_its_own_numbers(scored, o
                 m.apply(labels('sim', where, np.zeros(count)))
         assert m.steps == steps
         if scored:
-            m.sample_segments(rng, 64)
+            m.segments.sample(rng, 64)
         else:
-            m.sample_steps(rng, 256)
+            m.labelled.sample(rng, 256)
         del seen, taken, where
         held = tracemalloc.get_traced_memory()[0] - before
     finally:
@@ -431,7 +437,7 @@ def test_scoring_and_evicting_for_long_keeps_the_table_of_segments_small():
         m.score(score('sim', episode, 0, DELAY, float(episode)))
         m.score(score('sim', episode, DELAY, DELAY, float(episode)))
         m.evict()
-    values = m.segment_batch(m.segment_ids()).values
+    values = m.segments.batch(m.segments.ids()).values
     assert values.tolist() == [float(e) for e in range(395, 400) for _ in range(2)]
     assert m.nbytes < 80 * m.bytes_per_step + 200 * 41
 
@@ -459,12 +465,12 @@ def test_runs_are_whole_scored_segments_of_one_episode_that_end_with_the_given_o
                 length = min(5, steps - first)
                 where = {'source': source, 'episode': episode, 'first_step': first}
                 memory.score(builders.score(length=length, **where))
-    for number in memory.segment_ids():
-        ((source, (episode,), (first,), _),) = memory.segments(np.array([number]))
+    for number in memory.segments.ids():
+        ((source, (episode,), (first,), _),) = memory.segments.spans(np.array([number]))
         numbers[source, int(episode), int(first)] = int(number)
     names = {number: name for name, number in numbers.items()}
     asked = [('b', 0, 15), ('b', 0, 5), ('b', 1, 0), ('a', 0, 15), ('a', 0, 0)]
-    runs = memory.runs(np.array([numbers[name] for name in asked]), 3)
+    runs = memory.segments.runs(np.array([numbers[name] for name in asked]), 3)
     assert [[names[int(number)][2] for number in run] for run in runs] == [
         [5, 10, 15],
         [0, 5],
@@ -488,5 +494,5 @@ def test_a_run_ends_where_the_segment_before_is_cut_short():
     )
     for first, length in ((0, 5), (5, 3), (10, 5), (15, 2)):
         memory.score(builders.score(first_step=first, length=length))
-    ids = memory.segment_ids()
-    assert [len(run) for run in memory.runs(ids, 4)] == [1, 2, 1, 2]
+    ids = memory.segments.ids()
+    assert [len(run) for run in memory.segments.runs(ids, 4)] == [1, 2, 1, 2]

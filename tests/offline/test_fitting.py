@@ -69,9 +69,9 @@ def test_a_memory_holds_the_very_steps_scores_and_true_rewards_of_the_bag(tmp_pa
 
     loaded = load(bags, found, SIZES, DELAY, true_rewards=True)
 
-    ids = loaded.memory.segment_ids()
-    batch = loaded.memory.segment_batch(ids)
-    _, episodes, firsts, _ = loaded.memory.segments(ids)[0]
+    ids = loaded.memory.segments.ids()
+    batch = loaded.memory.segments.batch(ids)
+    _, episodes, firsts, _ = loaded.memory.segments.spans(ids)[0]
     assert len(ids) == 12
     for i, (episode, first) in enumerate(zip(episodes, firsts, strict=True)):
         chunk = chunks[episode]
@@ -86,8 +86,8 @@ def test_true_rewards_that_a_bag_has_not_are_nan_not_numbers(tmp_path):
     bag = Bag(write(tmp_path / 'bag', (r for r in records(2) if not isinstance(r, TrueRewards))))
     found = stretches(Index([bag]).read(), DELAY, 100).found
 
-    batch = (loaded := load([bag], found, SIZES, DELAY, true_rewards=True)).memory.segment_batch(
-        loaded.memory.segment_ids()
+    batch = (loaded := load([bag], found, SIZES, DELAY, true_rewards=True)).memory.segments.batch(
+        loaded.memory.segments.ids()
     )
 
     assert np.isnan(batch.true_rewards).all()

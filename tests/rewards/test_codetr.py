@@ -103,7 +103,7 @@ def model(data: Trajectories, steps: int = 3, **changes) -> Codetr:
 
 
 def whole(data: Trajectories, context: int = 0) -> SegmentBatch:
-    return data.segment_batch(data.segment_ids(), context)
+    return data.segments.batch(data.segments.ids(), context)
 
 
 def changed(batch: SegmentBatch, row: int, step: int) -> SegmentBatch:
@@ -337,7 +337,7 @@ def test_padding_changes_nothing_whatever_it_holds(changes):
         wider = made.label(padded(batch, 4, value=9.0))
         np.testing.assert_allclose(wider[:, :DELAY], before, rtol=1e-5, atol=1e-6)
         assert not wider[:, DELAY:].any()
-    alone = data.segment_batch(data.segment_ids()[[short]], made.context)
+    alone = data.segments.batch(data.segments.ids()[[short]], made.context)
     row = before[short, : batch.lengths[short]]
     np.testing.assert_allclose(made.label(alone)[0], row, rtol=1e-5, atol=1e-6)
 
@@ -348,7 +348,7 @@ def test_padding_changes_nothing_whatever_it_holds(changes):
 @pytest.mark.parametrize('kind', ['sum', 'sum_square', 'square_sum', 'max'])
 def test_sixty_four_segments_of_each_composite_type_are_learnt_by_heart(kind):
     data = memory(lengths=(128,) * 4, delay=8, kind=kind)
-    assert len(data.segment_ids()) == 64
+    assert len(data.segments.ids()) == 64
     config = settings(
         delay=8,
         initialisation='gpt2',  # as shipped
@@ -370,8 +370,10 @@ def test_sixty_four_segments_of_each_composite_type_are_learnt_by_heart(kind):
 def test_the_loss_is_the_mean_squared_error_of_the_segments_in_units_of_the_target_scale():
     data = memory()
     made = model(data)
-    batch = data.sample_segments(generator(0, 'x'), settings().codetr.batch)
-    expected = np.mean((made.predict(batch) - batch.values) ** 2) / data.score_scale() ** 2
+    batch = data.segments.sample(generator(0, 'x'), settings().codetr.batch)
+    expected = (
+        np.mean((made.predict(batch) - batch.values) ** 2) / data.segments.score_scale() ** 2
+    )
     said = made.gradient_step(data, generator(0, 'x'))
     assert said['reward_loss'] == pytest.approx(expected, rel=1e-4)
     assert said['learning_rate'] == learning_rate(settings().codetr, 3)
@@ -380,8 +382,10 @@ def test_the_loss_is_the_mean_squared_error_of_the_segments_in_units_of_the_targ
 def test_only_the_segments_own_steps_enter_the_loss_where_there_is_context():
     data = memory()
     made = model(data, context='episode', attention_scope='window')
-    batch = data.sample_segments(generator(0, 'x'), settings().codetr.batch, made.context)
-    expected = np.mean((made.predict(batch) - batch.values) ** 2) / data.score_scale() ** 2
+    batch = data.segments.sample(generator(0, 'x'), settings().codetr.batch, made.context)
+    expected = (
+        np.mean((made.predict(batch) - batch.values) ** 2) / data.segments.score_scale() ** 2
+    )
     assert made.gradient_step(data, generator(0, 'x'))['reward_loss'] == pytest.approx(
         expected, rel=1e-4
     )
@@ -421,7 +425,7 @@ def test_observations_are_standardised_by_moments_that_stay_as_they_were_at_the_
     data = memory(lengths=(60,) * 4)
     made = model(data)
     batch = whole(data)
-    mean, std = data.observation_moments()
+    mean, std = data.store.observation_moments()
     bare = model(data, steps=0, normalise_observations=False)
     bare.network.load_state_dict(made.network.state_dict())
     scaled = ((batch.observations - mean) / std).astype(np.float32)
@@ -445,7 +449,7 @@ def test_an_observation_that_stood_still_in_the_warm_up_is_not_blown_up():
 
 def test_without_a_target_scale_the_composite_rewards_are_learnt_as_they_are():
     data = memory(kind='square_sum')
-    assert model(data, steps=0).target_scale == data.score_scale() != 1.0
+    assert model(data, steps=0).target_scale == data.segments.score_scale() != 1.0
     assert model(data, steps=0, target_scale='none').target_scale == 1.0
 
 
@@ -499,7 +503,7 @@ def test_window_labels_are_those_of_a_naive_loop_over_steps(tokens, scope, label
         data, labelling='window', window=window, attention_scope=scope, label=label, tokens=tokens
     )
     found = np.concatenate(
-        [made.label_windows(b) for b in data.windows(data.segment_ids(), window, 7)]
+        [made.label_windows(b) for b in data.segments.windows(data.segments.ids(), window, 7)]
     )
     rng = np.random.default_rng(0)
     expected = []

@@ -97,7 +97,7 @@ def test_nothing_is_left_on_the_cpu_that_the_network_meets(method, tokens, dropo
         tensors = parameter, *model._optimiser.state[parameter].values()
         assert {tensor.device.type for tensor in tensors} == {'meta'}
     model.network.eval()
-    batch = data.segment_batch(data.segment_ids(), model.context)
+    batch = data.segments.batch(data.segments.ids(), model.context)
     assert model._step_rewards(batch).device.type == 'meta'
     assert model.state()['observation_mean'].device.type == 'meta'
 
@@ -155,12 +155,12 @@ def test_labels_put_together_on_the_device_are_those_of_the_host(
                 )
         data.evict()
         model.prepare(data)
-        ids = data.segment_ids()
-        batch = data.segment_batch(ids, model.context)
+        ids = data.segments.ids()
+        batch = data.segments.batch(ids, model.context)
         expected = model.label(batch)[segment_steps(batch)]
         found = model.label_on_device(data, ids)
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
-    assert min(ring.start for ring in data.sources) > 60
+    assert min(ring.start for ring in data.store.sources) > 60
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason='there is a GPU here')
@@ -177,7 +177,7 @@ def test_a_gpu_learns_and_labels_what_a_cpu_does(method):
     changes = {'codetr': {**settings(method).codetr.model_dump(), 'dropout': 0.0}}
     ours, theirs = (fitted(method, device, **changes) for device in ('cuda', 'cpu'))
     data = memory()
-    batch = data.segment_batch(data.segment_ids(), ours.context)
+    batch = data.segments.batch(data.segments.ids(), ours.context)
     np.testing.assert_allclose(ours.label(batch), theirs.label(batch), rtol=1e-3, atol=1e-3)
 
 
@@ -186,7 +186,7 @@ def test_a_gpu_learns_and_labels_what_a_cpu_does(method):
 def test_a_state_goes_from_one_device_to_another_and_the_same_seed_learns_the_same(method):
     ours, again = fitted(method, 'cuda'), fitted(method, 'cuda')
     data = memory()
-    batch = data.segment_batch(data.segment_ids(), ours.context)
+    batch = data.segments.batch(data.segments.ids(), ours.context)
     np.testing.assert_allclose(ours.label(batch), again.label(batch), rtol=1e-3, atol=1e-3)
     there = registry.make(settings(method), OBSERVATION, ACTION)
     there.load_state({name: tensor.cpu() for name, tensor in ours.state().items()})

@@ -33,7 +33,7 @@ class Scored:
 
 def guidance(method: Ircr, memory: Trajectories) -> list[float]:
     """The label of each segment, which all of its steps must have."""
-    labels = method.label(memory.segment_batch(memory.segment_ids()))
+    labels = method.label(memory.segments.batch(memory.segments.ids()))
     assert (labels == labels[:, :1]).all()
     return labels[:, 0].tolist()
 

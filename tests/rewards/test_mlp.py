@@ -29,7 +29,7 @@ def test_a_linear_step_reward_is_found_again_from_the_sums_of_segments_on_unseen
 def test_a_label_depends_on_its_own_step_alone():
     data = memory(lengths=(64,))
     made = trained(Mlp(settings(), O, A), data, 3)
-    batch = data.segment_batch(data.segment_ids())
+    batch = data.segments.batch(data.segments.ids())
     before = made.label(batch)
     batch.actions[0, 3] += 0.5
     batch.observations[1, 2] += 0.5
@@ -46,8 +46,10 @@ def test_sixty_four_segments_are_learnt_by_heart():
 def test_the_loss_is_the_mean_squared_error_of_the_sums_in_units_of_the_target_scale():
     data = memory((20, 11, 3))  # three segments are short
     made = trained(Mlp(settings(), O, A), data, 3)
-    batch = data.sample_segments(generator(0, 'x'), settings().mlp.batch)
-    expected = np.mean((made.predict(batch) - batch.values) ** 2) / data.score_scale() ** 2
+    batch = data.segments.sample(generator(0, 'x'), settings().mlp.batch)
+    expected = (
+        np.mean((made.predict(batch) - batch.values) ** 2) / data.segments.score_scale() ** 2
+    )
     assert made.gradient_step(data, generator(0, 'x'))['reward_loss'] == pytest.approx(
         expected, rel=1e-4
     )

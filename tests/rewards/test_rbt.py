@@ -46,7 +46,7 @@ def filled() -> Trajectories:
 
 
 def whole(data: Trajectories, context: int = 0) -> SegmentBatch:
-    return data.segment_batch(data.segment_ids(), context)
+    return data.segments.batch(data.segments.ids(), context)
 
 
 @pytest.mark.parametrize('tokens', ['pair', 'merged'])
@@ -122,15 +122,15 @@ def test_the_losses_are_those_of_each_segments_sum_and_next_observations_in_runs
 ):
     data = filled()
     rbt = made(data, rbt__attention_scope=scope, codetr__window=21)
-    ids = data.segment_ids()
+    ids = data.segments.ids()
     count = -(-settings().codetr.batch // segments)
     last = ids[generator(0, 'x').integers(0, len(ids), count)]
-    mean, std = data.observation_moments()
-    ((_, episodes, firsts, _),) = data.segments(ids)
-    scores = dict(zip(zip(episodes, firsts, strict=True), data.scores(ids), strict=True))
+    mean, std = data.store.observation_moments()
+    ((_, episodes, firsts, _),) = data.segments.spans(ids)
+    scores = dict(zip(zip(episodes, firsts, strict=True), data.segments.scores(ids), strict=True))
     sums, states = [], []
     for number in last:  # one window at a time, cut from its episode's steps
-        batch = data.segment_batch(np.array([number]), 1000)  # all steps before it
+        batch = data.segments.batch(np.array([number]), 1000)  # all steps before it
         begin = max(0, int(batch.context[0]) - (segments - 1) * 7)
         end = int(batch.lengths[0])
         observations = torch.tensor((batch.observations[0] - mean) / std, dtype=torch.float32)
@@ -145,7 +145,7 @@ def test_the_losses_are_those_of_each_segments_sum_and_next_observations_in_runs
         (episode,) = episodes[ids == number]
         for first in range(begin, end, 7):
             found = float(z[0, first - begin : first - begin + 7].sum())
-            sums.append((found - scores[episode, first] / data.score_scale()) ** 2)
+            sums.append((found - scores[episode, first] / data.segments.score_scale()) ** 2)
     said = rbt.gradient_step(data, generator(0, 'x'))
     assert said['reward_loss'] == pytest.approx(np.mean(sums), rel=1e-4)
     assert said['state_loss'] == pytest.approx(np.mean(states), rel=1e-4)
@@ -217,9 +217,9 @@ def test_the_weight_of_the_state_loss_is_what_the_settings_say():
 def test_in_windows_a_step_gets_the_output_of_the_window_that_ends_with_it():
     data = filled()
     rbt = made(data, codetr__labelling='window', codetr__window=5)
-    ids = data.segment_ids()[:2]  # the first 14 steps of the first episode
+    ids = data.segments.ids()[:2]  # the first 14 steps of the first episode
     found = np.concatenate(list(rbt.label_passes(data, ids)))
-    batch = data.segment_batch(ids)
+    batch = data.segments.batch(ids)
     for t in range(14):
         row, step = divmod(t, 7)
         first = max(0, step - 4)  # the window reaches into no other segment's attention ...

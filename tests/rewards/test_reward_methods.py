@@ -74,7 +74,7 @@ def filled(true_rewards: bool = True) -> Trajectories:
 
 
 def batch_of(memory: Trajectories, method: RewardMethod) -> SegmentBatch:
-    return memory.segment_batch(memory.segment_ids(), method.context)
+    return memory.segments.batch(memory.segments.ids(), method.context)
 
 
 def equal(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
@@ -142,8 +142,8 @@ class Contract:
         batch = batch_of(memory, made)
         together = made.label(batch)[segment_steps(batch)]
         alone = []
-        for number in memory.segment_ids():
-            one = memory.segment_batch(np.array([number]), made.context)
+        for number in memory.segments.ids():
+            one = memory.segments.batch(np.array([number]), made.context)
             alone.append(made.label(one)[segment_steps(one)])
         np.testing.assert_allclose(together, np.concatenate(alone), rtol=1e-4, atol=1e-5)
 
@@ -200,7 +200,7 @@ class Contract:
     def test_raw_labels_are_the_scaled_ones_times_the_target_scale(self):
         memory = filled()
         scaled, raw = self.trained(memory), self.trained(memory, reward_unit='raw')
-        assert scaled.target_scale == raw.target_scale == memory.score_scale()
+        assert scaled.target_scale == raw.target_scale == memory.segments.score_scale()
         batch = batch_of(memory, scaled)
         factor = scaled.target_scale if self.has_unit else 1.0
         np.testing.assert_allclose(raw.label(batch), scaled.label(batch) * factor, rtol=1e-5)
@@ -225,8 +225,8 @@ class Contract:
     def test_the_passes_of_labelling_give_every_step_its_label_in_order(self):
         memory = filled()
         made = self.trained(memory)
-        ids = memory.segment_ids()[1:4]
-        batch = memory.segment_batch(ids, made.context)
+        ids = memory.segments.ids()[1:4]
+        batch = memory.segments.batch(ids, made.context)
         found = np.concatenate(list(made.label_passes(memory, ids)))
         np.testing.assert_allclose(found, made.label(batch)[segment_steps(batch)], rtol=1e-5)
 
@@ -284,7 +284,7 @@ class PerceptronContract(LearnedContract):
         memory = filled()
         made = self.trained(memory)
         batch = batch_of(memory, made)
-        mean, std = memory.observation_moments()
+        mean, std = memory.store.observation_moments()
         far = []
         for deviations in (11, 1000):
             batch.observations[0, 2] = mean + deviations * std
@@ -415,7 +415,7 @@ class TestTrueReward(Rule):
         with pytest.raises(
             RewardModelError, match='no true_rewards; make the memory with true_rewards=True'
         ):
-            self.trained(memory).label(memory.segment_batch(memory.segment_ids()))
+            self.trained(memory).label(memory.segments.batch(memory.segments.ids()))
 
 
 class TestOnes(Rule):

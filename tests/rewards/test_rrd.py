@@ -89,18 +89,18 @@ def test_no_step_is_drawn_twice_unless_there_are_too_few():
 
 def test_segments_are_drawn_in_proportion_to_their_lengths():
     data = memory((24, 14, 3), 7)
-    ids = data.segment_ids()
-    assert set(data.lengths(ids).tolist()) == {3, 7}
+    ids = data.segments.ids()
+    assert set(data.segments.lengths(ids).tolist()) == {3, 7}
     drawn = draw_by_length(data, generator(0), 20_000)
     found = np.array([(drawn == i).sum() for i in ids])
-    expected = 20_000 * data.lengths(ids) / data.lengths(ids).sum()
+    expected = 20_000 * data.segments.lengths(ids) / data.segments.lengths(ids).sum()
     np.testing.assert_allclose(found, expected, atol=4 * np.sqrt(expected.max()))
 
 
 def test_a_label_depends_on_its_own_step_and_on_where_that_led():
     data = memory(lengths=(64,))
     made = trained(Rrd(settings(), O, A), data, 3)
-    batch = data.segment_batch(data.segment_ids())
+    batch = data.segments.batch(data.segments.ids())
     before = made.label(batch)
     batch.actions[0, 3] += 0.5
     batch.observations[1, 2] += 0.5
@@ -114,8 +114,8 @@ def test_the_loss_is_that_of_the_subsequences_drawn_in_units_of_the_target_scale
     data = memory()
     made = trained(Rrd(settings(rrd__subsequence_steps=DELAY), O, A), data, 3)
     drawn = draw_by_length(data, generator(0, 'x'), 4)
-    batch = data.segment_batch(drawn)
-    error = (made.predict(batch) - batch.values) / DELAY / data.score_scale()
+    batch = data.segments.batch(drawn)
+    error = (made.predict(batch) - batch.values) / DELAY / data.segments.score_scale()
     said = made.gradient_step(data, generator(0, 'x'))
     assert said['reward_loss'] == pytest.approx(np.mean(error**2), rel=1e-4)
 
@@ -128,7 +128,7 @@ def test_a_linear_step_reward_is_found_again_on_unseen_episodes_the_biased_loss_
             rrd__loss=loss, rrd__subsequences=32, rrd__learning_rate=1e-2, rrd__hidden=(32,)
         )
         made = trained(Rrd(config, O, A), data, 400)
-        spread[loss] = made.label(data.segment_batch(data.segment_ids())).std(1).mean()
+        spread[loss] = made.label(data.segments.batch(data.segments.ids())).std(1).mean()
         found[loss] = recovery(made, unseen)
     assert found['unbiased'] > 0.95 and found['biased'] > 0.5
     assert spread['biased'] < 0.8 * spread['unbiased']

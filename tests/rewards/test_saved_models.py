@@ -28,7 +28,7 @@ def test_a_frozen_model_labels_as_it_was_saved_and_each_segment_once(tmp_path):
     assert len(firsts) == len(set(firsts)) > 50
     made = before.method
     memory = core._memory
-    expected = np.concatenate(list(made.label_passes(memory, memory.segment_ids()[:3])))
+    expected = np.concatenate(list(made.label_passes(memory, memory.segments.ids()[:3])))
     assert np.array_equal(said[1][0].labels[: len(expected)], expected)
 
 

@@ -179,11 +179,12 @@ class Fixed:
 
     def __init__(self, batch: SegmentBatch) -> None:
         self.batch = batch
+        self.segments = self.store = self
 
-    def sample_segments(self, *arguments) -> SegmentBatch:
+    def sample(self, *arguments) -> SegmentBatch:
         return self.batch
 
-    def score_scale(self) -> float:
+    def target_scale(self, kind: str) -> float:
         return 1.5
 
     def observation_moments(self):

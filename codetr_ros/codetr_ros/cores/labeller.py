@@ -12,6 +12,7 @@ import torch
 from codetr_ros.config import Settings
 from codetr_ros.cores.consumer import Consumer
 from codetr_ros.memory import due
+from codetr_ros.memory.segments import Spans
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import (
     F32,
@@ -99,7 +100,7 @@ class Labeller(Consumer):
             # said of every phase: who plays a recorded run waits for it
             yield [self._metrics(phase, {'gradient_steps': method.gradient_steps})]
             return
-        if len(memory.segment_ids()) and not self._frozen:
+        if len(memory.segments.ids()) and not self._frozen:
             method.prepare(memory)
         metrics: dict[str, float] = {}
         for said in self._fit(phase, memory, method):
@@ -126,7 +127,7 @@ class Labeller(Consumer):
         steps = method.schedule.each if self._fitted else method.schedule.first
         if self._frozen:
             return
-        if steps and not len(memory.segment_ids()):
+        if steps and not len(memory.segments.ids()):
             self._counters['gradient steps skipped, nothing scored'] += steps
             return
         self._fitted = True
@@ -159,7 +160,9 @@ class Labeller(Consumer):
             yield from self._whole(phase, memory, method, np.unique(ids))
         elif len(ids):
             labels = yield from _joined(method, method.step_passes(memory, ids, within))
-            yield self._applied(phase, memory, memory.pieces(ids, within), labels, method.version)
+            yield self._applied(
+                phase, memory, memory.segments.step_spans(ids, within), labels, method.version
+            )
 
     def _whole(
         self, phase: int, memory: Trajectories, method: RewardMethod, ids: I64
@@ -168,17 +171,17 @@ class Labeller(Consumer):
         for i in range(0, len(ids), method.label_batch):
             some = ids[i : i + method.label_batch]
             labels = yield from _joined(method, method.label_passes(memory, some))
-            yield self._applied(phase, memory, memory.segments(some), labels, method.version)
+            yield self._applied(phase, memory, memory.segments.spans(some), labels, method.version)
 
     def _applied(
         self,
         phase: int,
         memory: Trajectories,
-        spans: list[tuple[str, I64, I64, I64]],
+        spans: Spans,
         labels: F32,
         version: int,
     ) -> list[StepRewards]:
-        """Labels of spans of steps, as `Trajectories.segments` says where these lie."""
+        """Labels of spans of steps, which lie where `Segments.spans` states."""
         found = []
         at = 0
         for source, *where in spans:

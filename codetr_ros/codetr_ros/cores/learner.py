@@ -111,7 +111,7 @@ class Learner(Consumer):
                 yield []
         metrics |= {
             'updates': learner.updates,
-            'labelled_steps': memory.labelled_steps,
+            'labelled_steps': memory.labelled.count,
             'memory_steps': memory.steps,
             'memory_bytes': memory.nbytes,
         }
@@ -143,7 +143,7 @@ class Learner(Consumer):
         assert self._learner is not None
         assert self._memory is not None
         state = dict(self._learner.state())
-        for source, labels in self._memory.labels().items():
+        for source, labels in self._memory.labelled.by_source().items():
             state[f'labels/{source}'] = torch.from_numpy(labels)
         return state
 

@@ -76,7 +76,7 @@ class DeviceSAC(FlatSAC):
         Returns:
             Whether any step is labelled, so that `replay` may be called.
         """
-        if not memory.labelled_steps:
+        if not memory.labelled.count:
             return False
         if self._steps is None or self._steps.memory is not memory:
             self._steps = DeviceMemory(memory, self.discount, self.device)

@@ -40,12 +40,12 @@ class FromLabels(OffPolicy):
         return self._sac.actor
 
     def _prepare(self, memory: Trajectories) -> bool:
-        return memory.labelled_steps > 0
+        return memory.labelled.count > 0
 
     def _burst(
         self, memory: Trajectories, rng: np.random.Generator, updates: int
     ) -> dict[str, Tensor]:
-        return self._sac.burst(updates, partial(memory.sample_steps, rng))
+        return self._sac.burst(updates, partial(memory.labelled.sample, rng))
 
     def state(self) -> dict[str, Tensor]:
         """Everything that it takes to go on from here, in copies."""

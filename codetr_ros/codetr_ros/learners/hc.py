@@ -45,7 +45,7 @@ from codetr_ros.config import Settings
 from codetr_ros.learners.base import LearnerError, OffPolicy, add
 from codetr_ros.learners.histories import HISTORIES, HistoryBatch, ScoredSteps
 from codetr_ros.learners.sac import Adam, q_values, squashed_gaussian, twin_critic
-from codetr_ros.memory.trajectories import Trajectories, measure_scale
+from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.policy.actor import Actor, describe
 from codetr_ros.system.states import check_state
 
@@ -115,7 +115,7 @@ class HC(OffPolicy):
         if not len(self._steps):
             return False
         if not self.target_scale:  # frozen with the first scores
-            self.target_scale = measure_scale(self._settings.target_scale, memory)
+            self.target_scale = memory.segments.target_scale(self._settings.target_scale)
         return True
 
     def _burst(

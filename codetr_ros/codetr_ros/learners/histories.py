@@ -36,8 +36,8 @@ class ScoredSteps:
 
     def __init__(self, memory: Trajectories) -> None:
         self._memory = memory
-        self._ids = memory.segment_ids()
-        lengths = [lengths for *_, lengths in memory.segments(self._ids)]
+        self._ids = memory.segments.ids()
+        lengths = [lengths for *_, lengths in memory.segments.spans(self._ids)]
         self._ends = np.cumsum(np.concatenate(lengths)) if lengths else np.zeros(0, np.int64)
 
     def __len__(self) -> int:
@@ -51,14 +51,14 @@ class ScoredSteps:
         """
         drawn = np.searchsorted(self._ends, rng.integers(0, len(self), segments), side='right')
         ids = self._ids[drawn]
-        whole = self._memory.segment_batch(ids)
+        whole = self._memory.segments.batch(ids)
         owners = np.arange(batch, dtype=np.int64) % segments
         return HistoryBatch(
             whole.observations,
             whole.actions,
             whole.lengths,
             whole.values,
-            self._memory.terminal(ids),
+            self._memory.segments.terminal(ids),
             owners,
             rng.integers(0, whole.lengths[owners]),
         )

@@ -137,11 +137,11 @@ class Lirpg:
         settings, own = self._settings, self._settings.lirpg
         if phase < settings.warmup_phases:
             self.counters['steps not learnt from, acted at random'] += memory.steps
-            everything = memory.newest([memory.steps] * settings.source_count)
+            everything = memory.store.newest([memory.steps] * settings.source_count)
             self._observe(everything.observations)
             return
         began = time.perf_counter()
-        rollout = memory.newest(settings.shares_of(phase))
+        rollout = memory.store.newest(settings.shares_of(phase))
         self.counters['steps evicted before they were learnt from'] += settings.steps_of(
             phase
         ) - len(rollout.rewards)

@@ -44,11 +44,11 @@ def drawn(settings: Settings, phase: int, memory: Trajectories) -> I64:
     """What SAC's updates of a phase will draw from a memory, as its labelled steps are now.
 
     Returns:
-        Places among the labelled steps (`Trajectories.draw`), ascending, each once.
+        Places among the labelled steps (`LabelledSteps.draw`), ascending, each once.
     """
-    found = np.zeros(memory.labelled_steps, np.bool_)
+    found = np.zeros(memory.labelled.count, np.bool_)
     if len(found):
         for burst in bursts(settings, phase):
             for _ in range(burst.updates):
-                found[memory.draw(burst.rng, settings.sac.batch)] = True
+                found[memory.labelled.draw(burst.rng, settings.sac.batch)] = True
     return np.flatnonzero(found)

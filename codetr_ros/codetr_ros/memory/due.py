@@ -18,8 +18,8 @@ def segments_due(memory: Trajectories, version: int, settings: Settings) -> I64:
     (`relabel_steps` 0), or whole segments of at most so many steps, those with the oldest labels
     first, among equals those with the lowest id; one at least.
     """
-    ids = memory.segment_ids()
-    versions = memory.versions(ids)
+    ids = memory.segments.ids()
+    versions = memory.segments.versions(ids)
     new = versions < 0
     if settings.relabel == 'drawn':
         return ids[new]
@@ -27,7 +27,7 @@ def segments_due(memory: Trajectories, version: int, settings: Settings) -> I64:
     if settings.relabel_steps:
         places = np.flatnonzero(stale)
         places = places[np.argsort(versions[places], kind='stable')]
-        steps = np.cumsum(memory.lengths(ids[places]))
+        steps = np.cumsum(memory.segments.lengths(ids[places]))
         enough = np.searchsorted(steps, settings.relabel_steps, side='right')
         stale[places[max(1, int(enough)) :]] = False
     due: I64 = ids[new | stale]
@@ -43,12 +43,12 @@ def steps_due(
         The id of each one's segment, and its number within the segment, ordered by both.
     """
     drawn = draws.drawn(settings, phase, memory)
-    return memory.located(drawn[memory.label_versions()[drawn] != version])
+    return memory.labelled.located(drawn[memory.labelled.versions()[drawn] != version])
 
 
 def metrics(memory: Trajectories, version: int) -> dict[str, float]:
     """How old labels are: the mean over all labelled steps, and the oldest."""
-    ages = version - memory.label_versions()
+    ages = version - memory.labelled.versions()
     if not len(ages):
         return {}
     return {'label_age_mean': float(ages.sum() / len(ages)), 'label_age_max': float(ages.max())}

@@ -51,7 +51,7 @@ class DeviceMemory:
         Returns:
             Whether rows lie where they lay before.
         """
-        rings = self.memory.sources
+        rings = self.memory.store.sources
         stayed = len(rings) == len(self._copied)
         if not stayed:
             self._allocate(rings)
@@ -92,7 +92,7 @@ class DeviceMemory:
 
     def _add(self, ring: SourceRing, rows: Tensor, first: int) -> None:
         for slots in ring.slots_from(first, COPIED_AT_ONCE):
-            steps = self.memory.steps_in(ring, slots)
+            steps = ring.steps_in(slots)
             going_on = np.float32(self._discount) * (1 - steps.terminated.astype(np.float32))
             last = np.stack([going_on, steps.rewards], 1)
             parts = (steps.observations, steps.actions, steps.next_observations, last)
@@ -143,7 +143,7 @@ class DeviceSteps:
         Raises:
             DeviceError: the device has no room.
         """
-        rings = sorted(self.memory.sources, key=lambda ring: ring.name)
+        rings = sorted(self.memory.store.sources, key=lambda ring: ring.name)
         if len(rings) != len(self._copied):
             self._allocate(rings)
         blocks = torch.split(self.rows, [ring.capacity for ring in rings])
@@ -176,7 +176,7 @@ class DeviceSteps:
             Observations (B, L, O) before each step and actions (B, L, A), 0 in the padding on the
             right, and which steps (B, L) there are, and which of them are the segments' own.
         """
-        places = np.stack(self.memory.places(ids, context))  # (4, B)
+        places = np.stack(self.memory.segments.places(ids, context))  # (4, B)
         source, row, length, before = torch.from_numpy(places).to(self._device)[..., None]
         step = torch.arange(int(places[2].max()), device=self._device)
         there = step < length  # (B, L)

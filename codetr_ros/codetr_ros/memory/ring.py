@@ -1,4 +1,4 @@
-"""The steps and segments of one source: where the memory D keeps its arrays."""
+"""The steps of one source: where the memory D keeps its arrays."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from codetr_ros.memory.batches import StepBatch
+from codetr_ros.memory.table import SegmentTable
 from codetr_ros.records import F32, F64, I64, Transitions
-
-COLUMNS = ('rows', 'lengths', 'offsets', 'episodes', 'values')
-"""What is known of each scored segment."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -26,7 +25,7 @@ class Rollout:
 
 
 @dataclass(slots=True)
-class Episode:
+class StoredEpisode:
     """Where an episode's steps lie."""
 
     number: int
@@ -56,22 +55,11 @@ class SourceRing:
         self.finals: dict[int, F32] = {}
         self.start = 0
         self.end = 0
-        self.episodes: deque[Episode] = deque()
+        self.episodes: deque[StoredEpisode] = deque()
         # kept when it is evicted: the next steps follow on it
-        self.newest: Episode | None = None
-        self.by_number: dict[int, Episode] = {}
-        # segments, grown by a quarter; number n lies at n - first_segment
-        self.first_segment = 0
-        self.segments = 0
-        self.segment_rows = np.empty(64, np.int64)
-        self.segment_lengths = np.empty(64, np.int32)
-        self.segment_offsets = np.empty(64, np.uint32)  # first step within the episode
-        self.segment_episodes = np.empty(64, np.uint32)
-        self.segment_values = np.empty(64, np.float64)
-        self.alive = np.empty(64, np.bool_)
-        # of each slot: 1 + the number of the segment that begins there, or 0; takes memory only
-        # where there are scores
-        self._beginning = np.zeros(capacity, np.uint32)
+        self.newest: StoredEpisode | None = None
+        self.by_number: dict[int, StoredEpisode] = {}
+        self.scored = SegmentTable(capacity)
 
     @property
     def steps(self) -> int:
@@ -79,30 +67,22 @@ class SourceRing:
         return self.end - self.start
 
     @property
-    def segments_nbytes(self) -> int:
-        """Bytes of what is known of scored segments."""
-        table = [getattr(self, f'segment_{name}') for name in COLUMNS]
-        each: int = sum(column.itemsize for column in table) + self.alive.itemsize
-        rows = min(self.end, self.capacity) if self.segments else 0
-        return self.segments * each + rows * 4
+    def used(self) -> int:
+        """Rows that have ever held a step: those take memory."""
+        return min(self.end, self.capacity)
 
-    def segment_from(self, row: int) -> int | None:
-        """The number of the scored segment whose first step lies in a row that is held."""
-        number = int(self._beginning[row % self.capacity])
-        return number - 1 if number else None
+    # ------------------------------------------------------------------------------------------
+    # changing
 
-    def slots_from(self, row: int, most: int) -> Iterator[I64]:
-        """Slots of the steps held from a row on, in order, at most so many at a time."""
-        for start in range(max(row, self.start), self.end, most):
-            yield np.arange(start, min(start + most, self.end)) % self.capacity
+    def begin(self, number: int, order: int) -> StoredEpisode:
+        """Open the next episode, which has no steps yet."""
+        episode = StoredEpisode(number, self.end, order)
+        self.newest = episode
+        self.episodes.append(episode)
+        self.by_number[number] = episode
+        return episode
 
-    def segments_over(self, rows: I64) -> I64:
-        """Where in the table the scored segments stand that rows (B,) lie in; each lies in one."""
-        table = np.flatnonzero(self.alive[: self.segments])
-        table = table[np.argsort(self.segment_rows[table], kind='stable')]
-        return table[np.searchsorted(self.segment_rows[table], rows, side='right') - 1]
-
-    def append(self, chunk: Transitions, episode: Episode) -> None:
+    def append(self, chunk: Transitions, episode: StoredEpisode) -> None:
         """Add steps that follow on those of the episode."""
         rows = np.arange(self.end, self.end + chunk.steps) % self.capacity
         self.observations[rows] = chunk.observations[:-1]
@@ -123,6 +103,67 @@ class SourceRing:
         self.last[rows[-1]] = True
         self.terminated[rows[-1]] = chunk.terminated
 
+    def evict_oldest(self) -> int:
+        """Drop the oldest episode with its segments; how many steps went."""
+        episode = self.episodes.popleft()
+        del self.by_number[episode.number]
+        rows = np.arange(episode.start, episode.start + episode.steps)
+        slots = rows % self.capacity
+        self.labels[slots] = np.nan
+        del self.finals[int(rows[-1])]
+        self.scored.drop(slots)
+        self.start = episode.start + episode.steps
+        return episode.steps
+
+    # ------------------------------------------------------------------------------------------
+    # reading
+
+    def slots_from(self, row: int, most: int) -> Iterator[I64]:
+        """Slots of the steps held from a row on, in order, at most so many at a time."""
+        for start in range(max(row, self.start), self.end, most):
+            yield np.arange(start, min(start + most, self.end)) % self.capacity
+
+    def steps_in(self, slots: I64) -> StepBatch:
+        """The steps that lie in some slots (B,); NaN for a reward that is not there."""
+        following = self.observations.take((slots + 1) % self.capacity, 0)
+        for i in np.flatnonzero(self.last[slots]):
+            row = self.start + (int(slots[i]) - self.start) % self.capacity
+            following[i] = self.finals[row]
+        return StepBatch(
+            self.observations.take(slots, 0),
+            self.actions.take(slots, 0),
+            self.labels.take(slots),
+            following,
+            self.terminated.take(slots),
+        )
+
+    def windows(self, rows: I64, lengths: I64, steps: int) -> tuple[F32, F32, F32 | None]:
+        """Steps that follow on each other, padded with zeros on the right.
+
+        Args:
+            rows: of each window's first step (B,).
+            lengths: each window's steps (B,).
+            steps: L that windows are padded to.
+
+        Returns:
+            Observations (B, L+1, O), the one after a window's last step included, actions
+            (B, L, A) and, where they are held, true rewards (B, L).
+        """
+        padding = np.arange(steps + 1) > lengths[:, None]
+        slots = (rows[:, None] + np.arange(steps + 1)) % self.capacity  # (B, L+1)
+        observations = self.observations[slots]
+        ends = rows + lengths - 1
+        for i in np.flatnonzero(self.last[ends % self.capacity]):
+            observations[i, lengths[i]] = self.finals[int(ends[i])]
+        observations[padding] = 0
+        actions = self.actions[slots[:, :-1]]
+        actions[padding[:, 1:]] = 0
+        if self.true_rewards is None:
+            return observations, actions, None
+        rewards = self.true_rewards[slots[:, :-1]]
+        rewards[padding[:, 1:]] = 0
+        return observations, actions, rewards
+
     def newest_steps(self, count: int) -> Rollout:
         """The last `count` steps, or as many as are held."""
         first = max(self.start, self.end - count)
@@ -133,10 +174,10 @@ class SourceRing:
         for i in np.flatnonzero(last):
             following[i] = self.finals[int(rows[i])]
         rewards = np.zeros(len(rows), np.float64)
-        scored = slice(0, self.segments)
-        ends = self.segment_rows[scored] + self.segment_lengths[scored] - 1 - first
-        new = self.alive[scored] & (ends >= 0)
-        rewards[ends[new]] = self.segment_values[scored][new]
+        scored = slice(0, self.scored.count)
+        ends = self.scored.rows[scored] + self.scored.lengths[scored] - 1 - first
+        new = self.scored.alive[scored] & (ends >= 0)
+        rewards[ends[new]] = self.scored.values[scored][new]
         return Rollout(
             self.observations[slots],
             self.actions[slots],
@@ -146,53 +187,8 @@ class SourceRing:
             last,
         )
 
-    def evict_oldest(self) -> int:
-        """Drop the oldest episode with its segments; how many steps went."""
-        episode = self.episodes.popleft()
-        del self.by_number[episode.number]
-        rows = np.arange(episode.start, episode.start + episode.steps)
-        self.labels[rows % self.capacity] = np.nan
-        del self.finals[int(rows[-1])]
-        self._drop_segments(episode)
-        self.start = episode.start + episode.steps
-        return episode.steps
 
-    def add_segment(self, row: int, length: int, offset: int, episode: int, value: float) -> int:
-        """Add a scored segment; its number."""
-        at = self.segments
-        for name in COLUMNS:
-            self._grow(f'segment_{name}', at)
-        self._grow('alive', at)
-        self.segment_rows[at], self.segment_lengths[at], self.segment_offsets[at] = (
-            row,
-            length,
-            offset,
-        )
-        self.segment_episodes[at], self.segment_values[at], self.alive[at] = episode, value, True
-        self.segments += 1
-        self._beginning[row % self.capacity] = self.first_segment + at + 1
-        return self.first_segment + at
-
-    def _grow(self, name: str, needed: int) -> None:
-        array = getattr(self, name)
-        if needed >= len(array):
-            more = np.empty(max(64, len(array) // 4), array.dtype)
-            setattr(self, name, np.concatenate([array, more]))
-
-    def _drop_segments(self, episode: Episode) -> None:
-        slots = np.arange(episode.start, episode.start + episode.steps) % self.capacity
-        numbers = self._beginning[slots].astype(np.int64)
-        self.alive[numbers[numbers > 0] - 1 - self.first_segment] = False
-        self._beginning[slots] = 0
-        dead = (
-            int(np.argmax(self.alive[: self.segments]))
-            if self.alive[: self.segments].any()
-            else self.segments
-        )
-        if dead > self.segments // 2 and dead >= 64:
-            for name in COLUMNS:
-                array = getattr(self, f'segment_{name}')
-                array[: self.segments - dead] = array[dead : self.segments].copy()
-            self.alive[: self.segments - dead] = self.alive[dead : self.segments].copy()
-            self.first_segment += dead
-            self.segments -= dead
+def ranges(starts: I64, lengths: I64) -> I64:
+    """Concatenate start, start + 1, ... of each (start, length)."""
+    offsets = np.repeat(starts - np.concatenate([[0], np.cumsum(lengths)[:-1]]), lengths)
+    return offsets + np.arange(int(lengths.sum()))

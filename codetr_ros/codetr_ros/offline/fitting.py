@@ -247,9 +247,9 @@ def _learn(
 
 def predictions(method: Learned, loaded: Loaded) -> np.ndarray:
     """Predicted composite rewards of all segments of a memory, in the task's unit."""
-    ids = loaded.memory.segment_ids()
+    ids = loaded.memory.segments.ids()
     made = [
-        method.predict(loaded.memory.segment_batch(ids[i : i + BATCH], method.context))
+        method.predict(loaded.memory.segments.batch(ids[i : i + BATCH], method.context))
         for i in range(0, len(ids), BATCH)
     ]
     return np.concatenate(made)
@@ -261,7 +261,7 @@ def held_out_loss(method: Learned, loaded: Loaded) -> float:
     Raises:
         RewardModelError: it is not finite: training has diverged.
     """
-    true = loaded.memory.scores(loaded.memory.segment_ids())
+    true = loaded.memory.segments.scores(loaded.memory.segments.ids())
     error = (predictions(method, loaded) - true) / method.target_scale
     loss = float(np.mean(error**2))
     if not np.isfinite(loss):

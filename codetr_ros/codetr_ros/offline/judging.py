@@ -59,8 +59,8 @@ def judge(method: RewardMethod, loaded: Loaded) -> Judgement:
         reward is known.
     """
     memory = loaded.memory
-    ids = memory.segment_ids()
-    values = memory.scores(ids)
+    ids = memory.segments.ids()
+    values = memory.segments.scores(ids)
     labels = labels_of(method, loaded, ids) * np.float32(method.unit)
     true = true_rewards_of(loaded, ids)
     inside = ~np.isnan(labels)
@@ -84,7 +84,7 @@ def judge(method: RewardMethod, loaded: Loaded) -> Judgement:
 
 def labels_of(method: RewardMethod, loaded: Loaded, ids: I64) -> F32:
     """Step rewards (S, L) of segments, NaN beyond their ends."""
-    lengths = loaded.memory.lengths(ids)
+    lengths = loaded.memory.segments.lengths(ids)
     found = np.full((len(ids), int(lengths.max())), np.nan, np.float32)
     for i in range(0, len(ids), method.label_batch):
         some = ids[i : i + method.label_batch]
@@ -97,10 +97,10 @@ def labels_of(method: RewardMethod, loaded: Loaded, ids: I64) -> F32:
 
 def true_rewards_of(loaded: Loaded, ids: I64) -> F32:
     """The environment's own rewards (S, L) of segments, NaN where they are not known."""
-    lengths = loaded.memory.lengths(ids)
+    lengths = loaded.memory.segments.lengths(ids)
     found = np.full((len(ids), int(lengths.max())), np.nan, np.float32)
     for i in range(0, len(ids), BATCH):
-        batch = loaded.memory.segment_batch(ids[i : i + BATCH])
+        batch = loaded.memory.segments.batch(ids[i : i + BATCH])
         if batch.true_rewards is not None:
             found[i : i + BATCH, : batch.true_rewards.shape[1]] = batch.true_rewards
     return found
@@ -117,13 +117,13 @@ def _shown(
 ) -> list[Shown]:
     """Segments for pictures: evenly from the lowest to the highest score."""
     memory = loaded.memory
-    order = np.argsort(memory.scores(ids), kind='stable')
+    order = np.argsort(memory.segments.scores(ids), kind='stable')
     chosen = order[np.linspace(0, len(ids) - 1, min(SHOWN, len(ids))).round().astype(int)]
-    _, episodes, firsts, lengths = memory.segments(ids)[0]
+    _, episodes, firsts, lengths = memory.segments.spans(ids)[0]
     found = []
     for i in chosen.tolist():
         stretch, length = loaded.stretches[int(episodes[i])], int(lengths[i])
-        batch = memory.segment_batch(ids[i : i + 1], method.context)
+        batch = memory.segments.batch(ids[i : i + 1], method.context)
         weights = method.step_weights(batch)
         found.append(
             Shown(

@@ -162,9 +162,9 @@ def _label(
     wanted = [stretch for part in parts for stretch in part]
     delay = max(int(s.segments.lengths.max()) for s in wanted)
     loaded = load([bag], wanted, (index.observation_size, index.action_size), delay)
-    ids = loaded.memory.segment_ids()
+    ids = loaded.memory.segments.ids()
     labels = labels_of(method, loaded, ids)
-    episodes = loaded.memory.segments(ids)[0][1]
+    episodes = loaded.memory.segments.spans(ids)[0][1]
     rows = {id(s): np.flatnonzero(episodes == i) for i, s in enumerate(loaded.stretches)}
     for part in parts:
         mine = labels[np.concatenate([rows[id(s)] for s in part])]

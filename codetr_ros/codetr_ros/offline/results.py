@@ -140,7 +140,7 @@ def of_epochs(
     held = fitted.held_out
     said['data'] |= {
         'held out': f'{len(held.stretches)} of {len(found.found)} stretches, '
-        f'{held.memory.steps} steps, {len(held.memory.segment_ids())} segments',
+        f'{held.memory.steps} steps, {len(held.memory.segments.ids())} segments',
         'steps held in memory at most': f'{fitted.most_steps} of memory_steps = '
         f'{settings.memory_steps}, {held.memory.bytes_per_step} bytes each',
         'times that the bags were read': 1 + fitted.reads,

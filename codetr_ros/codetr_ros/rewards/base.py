@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from codetr_ros.config import Settings
 from codetr_ros.memory.batches import SegmentBatch
-from codetr_ros.memory.trajectories import Trajectories, measure_scale
+from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import F32
 from codetr_ros.system.states import check_state
 
@@ -53,7 +53,7 @@ class RewardMethod(ABC):
     needs_true_rewards: ClassVar[bool] = False
     """Its memory must hold the environment's own rewards."""
     context: int = 0
-    """Steps before a segment that `label` wants in its batches: pass it to `segment_batch`."""
+    """Steps before a segment that `label` wants in its batches: pass it to `Segments.batch`."""
     label_batch: int = 256
     """Segments labelled at a time: how long a slice of labelling is."""
 
@@ -86,7 +86,7 @@ class RewardMethod(ABC):
         `memory` holds a scored segment.
         """
         if not self.target_scale:
-            self.target_scale = measure_scale(self._settings.target_scale, memory)
+            self.target_scale = memory.segments.target_scale(self._settings.target_scale)
 
     def gradient_step(self, memory: Trajectories, rng: np.random.Generator) -> dict[str, float]:
         """Learn from one batch, drawn from `memory` with `rng`; nothing unless a method does.
@@ -113,7 +113,7 @@ class RewardMethod(ABC):
 
     def label_passes(self, memory: Trajectories, ids: NDArray[np.int64]) -> Iterator[F32]:
         """Labels of the segments' steps one after the other, forward pass by forward pass."""
-        batch = memory.segment_batch(ids, self.context)
+        batch = memory.segments.batch(ids, self.context)
         yield self.label(batch)[segment_steps(batch)]
 
     @property

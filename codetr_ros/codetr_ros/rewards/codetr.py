@@ -78,7 +78,7 @@ class Codetr(SequenceMethod):
     def _terms(
         self, memory: Trajectories, rng: np.random.Generator
     ) -> Iterator[dict[str, Tensor]]:
-        batch = memory.sample_segments(rng, self._codetr.batch, self.context)
+        batch = memory.segments.sample(rng, self._codetr.batch, self.context)
         for part in self._parts(batch):
             weights, rewards = self.network(*self._inputs(part))  # (b, L) each
             inside = self._put(segment_steps(part))

@@ -59,7 +59,7 @@ class Ircr(RewardMethod):
     def prepare(self, memory: Trajectories) -> None:
         """Look at the scores that the memory holds: the extremes may move, and the labels too."""
         super().prepare(memory)
-        scores = memory.scores(memory.segment_ids())
+        scores = memory.segments.scores(memory.segments.ids())
         extremes = float(scores.min()), float(scores.max())
         if self._moves:
             extremes = min(self._least, extremes[0]), max(self._greatest, extremes[1])

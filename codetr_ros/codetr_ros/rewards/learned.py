@@ -113,7 +113,7 @@ class Learned(RewardMethod):
             return
         super().prepare(memory)
         if self._own.normalise_observations:
-            mean, std = memory.observation_moments()
+            mean, std = memory.store.observation_moments()
             self._mean = self._put(mean.astype(np.float32))
             self._std = self._put(np.maximum(std, STD_FLOOR).astype(np.float32))
 

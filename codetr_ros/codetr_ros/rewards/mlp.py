@@ -34,7 +34,7 @@ class Mlp(Learned):
     def _terms(
         self, memory: Trajectories, rng: np.random.Generator
     ) -> Iterator[dict[str, Tensor]]:
-        batch = memory.sample_segments(rng, self._settings.mlp.batch)
+        batch = memory.segments.sample(rng, self._settings.mlp.batch)
         inside = self._put(segment_steps(batch))  # (B, L)
         predicted = (self._step_rewards(batch) * inside).sum(1)  # (B,)
         yield {'reward_loss': F.mse_loss(predicted, self._scaled(batch.values))}

@@ -74,10 +74,10 @@ class Rbt(SequenceMethod):
         self, memory: Trajectories, rng: np.random.Generator
     ) -> Iterator[dict[str, Tensor]]:
         """`reward_loss` of the sums, and `state_loss` of next observations times its weight."""
-        ids = memory.segment_ids()
+        ids = memory.segments.ids()
         last = ids[rng.integers(0, len(ids), -(-self._codetr.batch // self._segments))]
-        windows = memory.runs(last, self._segments)
-        batch = memory.segment_batch(np.concatenate(windows))  # (S, n): S segments of all windows
+        windows = memory.segments.runs(last, self._segments)
+        batch = memory.segments.batch(np.concatenate(windows))  # (S, n): S segments of all windows
         row, place = places([len(window) for window in windows])
         inside = side_by_side(self._put(segment_steps(batch)), row, place)  # (B, L)
         before = self._standardised(batch.observations[:, :-1])

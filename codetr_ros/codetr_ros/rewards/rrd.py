@@ -62,7 +62,7 @@ class Rrd(Learned):
     ) -> Iterator[dict[str, Tensor]]:
         rrd = self._settings.rrd
         drawn = draw_by_length(memory, rng, rrd.subsequences)
-        batch = memory.segment_batch(drawn)
+        batch = memory.segments.batch(drawn)
         steps = subsequences(rng, batch.lengths, rrd.subsequence_steps)  # (B, K)
         rewards = self._rewards_at(batch, steps)
         returns = self._scaled(batch.values / batch.lengths)
@@ -92,11 +92,11 @@ def draw_by_length(memory: Trajectories, rng: np.random.Generator, count: int) -
     Each uniformly drawn one is kept with probability length / delay: no table of all lengths is
     needed for it.
     """
-    ids = memory.segment_ids()
+    ids = memory.segments.ids()
     kept = np.empty(0, np.int64)
     while len(kept) < count:
         some = ids[rng.integers(0, len(ids), count)]
-        lucky = rng.random(count) * memory.delay < memory.lengths(some)
+        lucky = rng.random(count) * memory.delay < memory.segments.lengths(some)
         kept = np.concatenate([kept, some[lucky]])
     return kept[:count]
 

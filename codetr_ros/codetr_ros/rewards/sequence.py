@@ -69,7 +69,7 @@ class SequenceMethod(Learned):
         elif self._codetr.labelling == 'segment':
             yield from super().label_passes(memory, ids)
         else:
-            for batch in memory.windows(ids, self._codetr.window, self.label_batch):
+            for batch in memory.segments.windows(ids, self._codetr.window, self.label_batch):
                 yield self.label_windows(batch)
 
     def label_on_device(self, memory: Trajectories, ids: NDArray[np.int64]) -> F32:
@@ -80,7 +80,7 @@ class SequenceMethod(Learned):
         self._on_device.update()
         self.network.eval()
         labels = []
-        longest = int(memory.lengths(ids).max()) + self.context
+        longest = int(memory.segments.lengths(ids).max()) + self.context
         with torch.inference_mode():
             for some in np.array_split(ids, self._part_count(len(ids), longest)):
                 observations, actions, there, own = self._on_device.read(some, self.context)
@@ -98,7 +98,9 @@ class SequenceMethod(Learned):
         self, memory: Trajectories, ids: NDArray[np.int64], within: NDArray[np.int64]
     ) -> Iterator[F32]:
         """Labels of single steps, from windows."""
-        for batch in memory.step_windows(ids, within, self._codetr.window, self.label_batch):
+        for batch in memory.segments.step_windows(
+            ids, within, self._codetr.window, self.label_batch
+        ):
             yield self.label_windows(batch)
 
     def label_windows(self, batch: SegmentBatch) -> F32:

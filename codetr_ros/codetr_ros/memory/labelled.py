@@ -1,0 +1,169 @@
+"""The labelled steps of the memory D: step rewards, the versions that gave them, and draws."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from codetr_ros.memory.batches import StepBatch
+from codetr_ros.memory.ring import ranges
+from codetr_ros.memory.segments import segment_ids
+from codetr_ros.memory.store import Store
+from codetr_ros.records import F32, I64, RecordError, StepRewards
+
+Slots = NDArray[np.uint32] | NDArray[np.int64]
+
+
+class LabelledSteps:
+    """The steps of a store that have a step reward.
+
+    They are numbered source by source, in the order of names, and within a source by their slots.
+    Such a number is a step's place among them; it holds until the next change of the memory.
+
+    Args:
+        store: where the steps lie.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        # (place of the source) * (rows of a source) + slot, of each labelled step
+        self._slots: Slots | None = None
+
+    # ------------------------------------------------------------------------------------------
+    # changing
+
+    def apply(self, rewards: StepRewards) -> int:
+        """Store labels, and pass over those of episodes that were evicted.
+
+        Returns:
+            How many labels were passed over.
+
+        Raises:
+            RecordError: a label is for steps that are not here; nothing is stored then.
+        """
+        if len(rewards.lengths) == 0:
+            return 0
+        source = self._store.source(rewards.source)
+        if source is None:
+            raise RecordError(
+                f'step rewards for {rewards.source!r}, which sent no steps; sources: '
+                f'{[source.name for source in self._store.sources]}'
+            )
+        starts = np.zeros(len(rewards.lengths), np.int64)
+        evicted = np.zeros(len(starts), np.bool_)
+        newest = source.newest.number if source.newest else -1
+        triples = zip(
+            rewards.episodes.tolist(),
+            rewards.first_steps.tolist(),
+            rewards.lengths.tolist(),
+            strict=True,
+        )
+        for i, (number, first, length) in enumerate(triples):
+            episode = source.by_number.get(number)
+            if episode is None and number <= newest:
+                evicted[i] = True
+            elif episode is None or first + length > episode.steps:
+                raise RecordError(
+                    f'step rewards of phase {rewards.phase} for {rewards.source!r}, episode '
+                    f'{number}, first_step {first}, length {length}: these steps are not here'
+                )
+            else:
+                starts[i] = episode.start + first
+        keep = np.repeat(~evicted, rewards.lengths)
+        slots = ranges(starts, rewards.lengths.astype(np.int64))[keep] % source.capacity
+        source.labels[slots] = rewards.labels[keep]
+        source.versions[slots] = rewards.version
+        self.forget()
+        return int(np.count_nonzero(~keep))
+
+    def forget(self) -> None:
+        """Drop the list of labelled steps: it is made anew when it is next asked for."""
+        self._slots = None
+
+    # ------------------------------------------------------------------------------------------
+    # asking
+
+    @property
+    def count(self) -> int:
+        """Steps that have a step reward."""
+        return len(self._places())
+
+    def by_source(self) -> dict[str, F32]:
+        """The labels of each source's steps, in order; NaN where there is none."""
+        return {
+            source.name: source.labels[np.arange(source.start, source.end) % source.capacity]
+            for source in self._store.sources
+        }
+
+    def versions(self) -> I64:
+        """The version of the model that gave each labelled step its label."""
+        rings = self._store.by_name()
+        parts = [s.versions[: s.used][np.isfinite(s.labels[: s.used])] for s in rings]
+        return np.concatenate([np.empty(0, np.int64), *parts])
+
+    def draw(self, rng: np.random.Generator, batch: int) -> I64:
+        """Places (B,) among the labelled steps, drawn uniformly, with replacement.
+
+        What is drawn one after the other is the same in batches of any size.
+
+        Raises:
+            ValueError: no step is labelled.
+        """
+        if not self.count:
+            raise ValueError('no step of the memory is labelled: nothing to sample')
+        return rng.integers(0, self.count, batch)
+
+    def sample(self, rng: np.random.Generator, batch: int) -> StepBatch:
+        """Draw labelled steps uniformly, with replacement.
+
+        Raises:
+            ValueError: no step is labelled.
+        """
+        drawn = self._places()[self.draw(rng, batch)].astype(np.int64)
+        sources = self._store.by_name()
+        if len(sources) == 1:
+            return sources[0].steps_in(drawn)
+        observations = np.empty((batch, self._store.observation_size), np.float32)
+        result = StepBatch(
+            observations,
+            np.empty((batch, self._store.action_size), np.float32),
+            np.empty(batch, np.float32),
+            np.empty_like(observations),
+            np.empty(batch, np.bool_),
+        )
+        for index, source in enumerate(sources):
+            mine = np.flatnonzero(drawn // self._store.rows == index)
+            some = source.steps_in(drawn[mine] % self._store.rows)
+            for name in StepBatch.__dataclass_fields__:
+                getattr(result, name)[mine] = getattr(some, name)
+        return result
+
+    def located(self, places: I64) -> tuple[I64, I64]:
+        """Where labelled steps lie, given by their places among them.
+
+        Returns:
+            The id of each one's segment (B,), and its number within the segment (B,), ordered by
+            the one and then by the other.
+        """
+        chosen = self._places()[places].astype(np.int64)
+        ids, within = np.empty_like(chosen), np.empty_like(chosen)
+        for index, source in enumerate(self._store.by_name()):
+            mine = np.flatnonzero(chosen // self._store.rows == index)
+            slots = chosen[mine] % self._store.rows
+            rows = source.start + (slots - source.start) % source.capacity
+            at = source.scored.over(rows)
+            ids[mine] = segment_ids(index, at + source.scored.first)
+            within[mine] = rows - source.scored.rows[at]
+        order = np.lexsort((within, ids))
+        return ids[order], within[order]
+
+    def _places(self) -> Slots:
+        if self._slots is None:
+            rows = self._store.rows
+            sources = self._store.by_name()
+            parts = [
+                np.flatnonzero(np.isfinite(s.labels[: s.used])) + i * rows
+                for i, s in enumerate(sources)
+            ]
+            slots = np.concatenate(parts) if parts else np.empty(0, np.int64)
+            small = len(sources) * rows <= 2**32
+            self._slots = slots.astype(np.uint32) if small else slots
+        return self._slots

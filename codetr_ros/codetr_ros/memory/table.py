@@ -1,0 +1,106 @@
+"""The table of a source's scored segments, numbered in the order in which they were scored."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from codetr_ros.records import F64, I64
+
+COLUMNS = ('rows', 'lengths', 'offsets', 'episodes', 'values', 'alive')
+
+
+class SegmentTable:
+    """Where a source's scored segments lie, and their composite rewards.
+
+    Segment number n stands at n - `first` of every column, of which `count` entries are in use.
+    The columns grow by a quarter; they move up when half of them is of evicted segments.
+
+    Args:
+        capacity: slots of the source's ring: row r lies in slot r % capacity.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self.first = 0
+        self.count = 0
+        self.rows = np.empty(64, np.int64)  # of the first step
+        self.lengths = np.empty(64, np.int32)
+        self.offsets = np.empty(64, np.uint32)  # the first step's number within the episode
+        self.episodes = np.empty(64, np.uint32)
+        self.values = np.empty(64, np.float64)
+        self.alive = np.empty(64, np.bool_)  # not evicted
+        # of each slot: 1 + the number of the segment that begins there, or 0; takes memory only
+        # where there are scores
+        self._beginning = np.zeros(capacity, np.uint32)
+
+    def nbytes(self, rows: int) -> int:
+        """Bytes in use, where the ring has so many rows in use."""
+        each: int = sum(getattr(self, name).itemsize for name in COLUMNS)
+        return self.count * each + (rows * self._beginning.itemsize if self.count else 0)
+
+    def numbers(self) -> I64:
+        """The numbers of the segments that are held, ascending."""
+        return np.flatnonzero(self.alive[: self.count]) + self.first
+
+    def per_step(self) -> F64:
+        """The composite reward per step of each segment that is held."""
+        values: F64 = self.values[: self.count] / self.lengths[: self.count]
+        return values[self.alive[: self.count]]
+
+    def beginning_at(self, row: int) -> int | None:
+        """The number of the segment whose first step lies in a row that is held."""
+        number = int(self._beginning[row % self.capacity])
+        return number - 1 if number else None
+
+    def over(self, rows: I64) -> I64:
+        """Where in the table the segments stand that rows (B,) lie in; each lies in one."""
+        table = np.flatnonzero(self.alive[: self.count])
+        table = table[np.argsort(self.rows[table], kind='stable')]
+        return table[np.searchsorted(self.rows[table], rows, side='right') - 1]
+
+    def whole_before(self, at: int, steps: int, most: int) -> list[int]:
+        """Numbers of the whole segments that lie right before one in its episode, in order.
+
+        Args:
+            at: where in the table that one stands.
+            steps: of a whole segment.
+            most: how many are looked for.
+        """
+        row, first = int(self.rows[at]), int(self.offsets[at])
+        numbers: list[int] = []
+        while len(numbers) < most:
+            back = (len(numbers) + 1) * steps
+            number = self.beginning_at(row - back) if back <= first else None
+            if number is None or self.lengths[number - self.first] < steps:
+                break
+            numbers.append(number)
+        return numbers[::-1]
+
+    def add(self, row: int, length: int, offset: int, episode: int, value: float) -> None:
+        """Add a segment."""
+        at = self.count
+        if at >= len(self.rows):
+            self._grow()
+        self.rows[at], self.lengths[at], self.offsets[at] = row, length, offset
+        self.episodes[at], self.values[at], self.alive[at] = episode, value, True
+        self.count += 1
+        self._beginning[row % self.capacity] = self.first + at + 1
+
+    def _grow(self) -> None:
+        for name in COLUMNS:
+            column = getattr(self, name)
+            more = np.empty(max(64, len(column) // 4), column.dtype)
+            setattr(self, name, np.concatenate([column, more]))
+
+    def drop(self, slots: NDArray[np.int64]) -> None:
+        """Drop the segments that begin in some slots."""
+        numbers = self._beginning[slots].astype(np.int64)
+        self.alive[numbers[numbers > 0] - 1 - self.first] = False
+        self._beginning[slots] = 0
+        alive = self.alive[: self.count]
+        dead = int(np.argmax(alive)) if alive.any() else self.count
+        if dead > self.count // 2 and dead >= 64:
+            for name in COLUMNS:
+                column = getattr(self, name)
+                column[: self.count - dead] = column[dead : self.count].copy()
+            self.first += dead
+            self.count -= dead
