@@ -15,24 +15,94 @@ Gathering a million steps in whole segments takes half a second on a CPU, and al
 labelled in every phase: so segments are put together on the device.
 """
 
+from abc import ABC, abstractmethod
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from codetr_ros.memory.ring import SourceRing
 from codetr_ros.memory.trajectories import Trajectories
-from codetr_ros.records import I64
+from codetr_ros.records import F32, I64
 from codetr_ros.system.devices import DeviceError
 
 COPIED_AT_ONCE = 65_536
 """Steps that are put into rows in one go: more would take memory and save no time."""
 
 
-class DeviceMemory:
-    """Rows of steps on a device, and which of them are labelled.
+class DeviceRows(ABC):
+    """The steps of the memory D on a device, each in the row of its slot, source after source.
 
     The tensors stay where they are, so that a recorded update finds them, until another source
     appears.
+
+    Args:
+        memory: the memory D, on the host.
+        device: where the rows lie.
+        setting: the setting that names the device.
+        bytes_per_step: what a step takes there.
+    """
+
+    rows: Tensor
+
+    def __init__(
+        self, memory: Trajectories, device: torch.device, setting: str, bytes_per_step: int
+    ) -> None:
+        self.memory = memory
+        self._device = device
+        self._setting = setting
+        self._bytes_per_step = bytes_per_step
+        self._copied: list[int] = []  # of each source, the row after the last one that is here
+
+    @abstractmethod
+    def _take(self, size: int) -> None:
+        """Make the tensors for so many steps, `rows` among them."""
+
+    @abstractmethod
+    def _packed(self, ring: SourceRing, slots: I64) -> F32:
+        """The rows of the steps in some slots of a source."""
+
+    def _blocks(self, rings: list[SourceRing]) -> tuple[Tensor, ...]:
+        """The rows of each source."""
+        return torch.split(self.rows, [ring.capacity for ring in rings])
+
+    def _copy(self, rings: list[SourceRing]) -> bool:
+        """Take in the steps that are new in D.
+
+        Returns:
+            Whether rows lie where they lay before.
+
+        Raises:
+            DeviceError: the device has no room.
+        """
+        stayed = len(rings) == len(self._copied)
+        if not stayed:
+            self._allocate(rings)
+        for i, (ring, rows) in enumerate(zip(rings, self._blocks(rings), strict=True)):
+            for slots in ring.slots_from(self._copied[i], COPIED_AT_ONCE):
+                new = torch.from_numpy(self._packed(ring, slots)).to(self._device)
+                rows.index_copy_(0, torch.from_numpy(slots).to(self._device), new)
+            self._copied[i] = ring.end
+        return stayed
+
+    def _allocate(self, rings: list[SourceRing]) -> None:
+        """Make room for all that the sources' rings can hold."""
+        size = sum(ring.capacity for ring in rings)
+        self._take(0)  # the old rows go before the new ones come
+        try:
+            self._take(size)
+        except RuntimeError as error:  # torch's own where a GPU is out of memory
+            raise DeviceError(
+                f'{self._setting}={self._device}: no room for {size} steps of '
+                f'{self._bytes_per_step} bytes, memory_steps for each of {len(rings)} '
+                'environments: lower memory_steps, simulators or envs, or set '
+                f'{self._setting}=cpu. torch said: {error}'
+            ) from error
+        self._copied = [0] * len(rings)
+
+
+class DeviceMemory(DeviceRows):
+    """Steps as SAC draws them, and which of them are labelled.
 
     Args:
         memory: the memory D, on the host.
@@ -41,63 +111,40 @@ class DeviceMemory:
     """
 
     def __init__(self, memory: Trajectories, discount: float, device: torch.device) -> None:
-        self.memory = memory
-        self._discount, self._device = discount, device
-        self._copied: list[int] = []  # of each source, the row after the last one that is here
+        self._width = 2 * memory.observation_size + memory.action_size + 2
+        super().__init__(memory, device, 'device', 4 * self._width + 8)
+        self._discount = discount
 
     def update(self) -> bool:
         """Take in what is new in D, and what is labelled differently or gone.
 
         Returns:
             Whether rows lie where they lay before.
+
+        Raises:
+            DeviceError: the device has no room.
         """
         rings = self.memory.store.sources
-        stayed = len(rings) == len(self._copied)
-        if not stayed:
-            self._allocate(rings)
-        for i, (ring, rows) in enumerate(zip(rings, self._blocks(rings), strict=True)):
-            self._add(ring, rows, self._copied[i])
-            self._copied[i] = ring.end
-            held = min(ring.end, ring.capacity)
-            rows[:held, -1] = torch.from_numpy(ring.labels[:held]).to(self._device)
+        stayed = self._copy(rings)
+        for ring, rows in zip(rings, self._blocks(rings), strict=True):
+            labels = torch.from_numpy(ring.labels[: ring.used])
+            rows[: ring.used, -1] = labels.to(self._device)
         labelled = self.rows[:, -1].isfinite().nonzero().squeeze(1)  # the device is waited for
         self._labelled[: len(labelled)] = labelled
         self._count.fill_(len(labelled))
         return stayed
 
-    def _allocate(self, rings: list[SourceRing]) -> None:
-        """Make room for all that the sources' rings can hold.
-
-        Raises:
-            DeviceError: the device has not got it.
-        """
-        size = sum(ring.capacity for ring in rings)
-        width = 2 * self.memory.observation_size + self.memory.action_size + 2
-        self.rows = self._labelled = torch.empty(0)  # the old ones go before the new ones come
-        try:
-            self.rows = torch.full((size, width), torch.nan, device=self._device)
-            self._labelled = torch.zeros(size, dtype=torch.int64, device=self._device)
-        except RuntimeError as error:  # torch's own where a GPU is out of memory
-            raise DeviceError(
-                f'device={self._device}: no room for {size} steps of {4 * width + 8} bytes, '
-                f'memory_steps for each of {len(rings)} environments: lower memory_steps, '
-                f'simulators or envs, or set device=cpu. torch said: {error}'
-            ) from error
+    def _take(self, size: int) -> None:
+        self.rows = torch.full((size, self._width), torch.nan, device=self._device)
+        self._labelled = torch.zeros(size, dtype=torch.int64, device=self._device)
         self._count = torch.zeros((), dtype=torch.int64, device=self._device)
-        self._copied = [0] * len(rings)
 
-    def _blocks(self, rings: list[SourceRing]) -> tuple[Tensor, ...]:
-        """The rows of each source; a step lies in the row of its slot."""
-        return torch.split(self.rows, [ring.capacity for ring in rings])
-
-    def _add(self, ring: SourceRing, rows: Tensor, first: int) -> None:
-        for slots in ring.slots_from(first, COPIED_AT_ONCE):
-            steps = ring.steps_in(slots)
-            going_on = np.float32(self._discount) * (1 - steps.terminated.astype(np.float32))
-            last = np.stack([going_on, steps.rewards], 1)
-            parts = (steps.observations, steps.actions, steps.next_observations, last)
-            new = torch.from_numpy(np.concatenate(parts, 1))
-            rows.index_copy_(0, torch.from_numpy(slots).to(self._device), new.to(self._device))
+    def _packed(self, ring: SourceRing, slots: I64) -> F32:
+        steps = ring.steps_in(slots)
+        going_on = np.float32(self._discount) * (1 - steps.terminated.astype(np.float32))
+        last = np.stack([going_on, steps.rewards], 1)
+        parts = (steps.observations, steps.actions, steps.next_observations, last)
+        return np.concatenate(parts, 1)
 
     def draw(self, batch: int) -> Tensor:
         """Rows (B,) of labelled steps, uniform and with replacement, at least one being labelled.
@@ -124,8 +171,8 @@ def columns(rows: Tensor, observation_size: int, action_size: int) -> tuple[Tens
     return s, a, r.squeeze(1), s2, going_on.squeeze(1)
 
 
-class DeviceSteps:
-    """The steps of the memory on a device, each in the row of its slot, source after source.
+class DeviceSteps(DeviceRows):
+    """Steps as a reward model reads them, the sources in the order of their names.
 
     Args:
         memory: the memory D, on the host.
@@ -133,9 +180,8 @@ class DeviceSteps:
     """
 
     def __init__(self, memory: Trajectories, device: torch.device) -> None:
-        self.memory = memory
-        self._device = device
-        self._copied: list[int] = []  # of each source, the row after the last one that is here
+        self._sizes = [memory.observation_size, memory.action_size]
+        super().__init__(memory, device, 'reward_device', 4 * sum(self._sizes))
 
     def update(self) -> None:
         """Take in what is new in D.
@@ -143,31 +189,17 @@ class DeviceSteps:
         Raises:
             DeviceError: the device has no room.
         """
-        rings = sorted(self.memory.store.sources, key=lambda ring: ring.name)
-        if len(rings) != len(self._copied):
-            self._allocate(rings)
-        blocks = torch.split(self.rows, [ring.capacity for ring in rings])
-        for i, (ring, rows) in enumerate(zip(rings, blocks, strict=True)):
-            for slots in ring.slots_from(self._copied[i], COPIED_AT_ONCE):
-                new = np.concatenate([ring.observations[slots], ring.actions[slots]], 1)
-                rows[torch.from_numpy(slots).to(self._device)] = torch.tensor(new).to(self._device)
-            self._copied[i] = ring.end
+        rings = self.memory.store.by_name()
+        if not self._copy(rings):
+            capacities = torch.tensor([ring.capacity for ring in rings])
+            self._capacities = capacities.to(self._device)
+            self._firsts = (capacities.cumsum(0) - capacities).to(self._device)
 
-    def _allocate(self, rings: list[SourceRing]) -> None:
-        size = sum(ring.capacity for ring in rings)
-        width = self.memory.observation_size + self.memory.action_size
-        self.rows = torch.empty(0)  # the old ones go before the new ones come
-        try:
-            self.rows = torch.zeros(size, width, device=self._device)
-        except RuntimeError as error:  # torch's own where a GPU is out of memory
-            raise DeviceError(
-                f'reward_device={self._device}: no room for {size} steps of {4 * width} bytes: '
-                f'lower memory_steps, or set reward_device=cpu. torch said: {error}'
-            ) from error
-        capacities = torch.tensor([ring.capacity for ring in rings])
-        self._capacities = capacities.to(self._device)
-        self._firsts = (capacities.cumsum(0) - capacities).to(self._device)
-        self._copied = [0] * len(rings)
+    def _take(self, size: int) -> None:
+        self.rows = torch.zeros(size, sum(self._sizes), device=self._device)
+
+    def _packed(self, ring: SourceRing, slots: I64) -> F32:
+        return np.concatenate([ring.observations[slots], ring.actions[slots]], 1)
 
     def read(self, ids: I64, context: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Segments by id, each with up to `context` steps of its episode before it.
@@ -182,6 +214,5 @@ class DeviceSteps:
         there = step < length  # (B, L)
         slots = self._firsts[source] + (row + step) % self._capacities[source]
         steps = self.rows[slots].masked_fill_(~there[..., None], 0)
-        sizes = [self.memory.observation_size, self.memory.action_size]
-        observations, actions = torch.split(steps, sizes, -1)
+        observations, actions = torch.split(steps, self._sizes, -1)
         return observations, actions, there, there & (step >= before)
