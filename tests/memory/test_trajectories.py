@@ -334,6 +334,27 @@ def test_steps_that_do_not_follow_on_are_refused_and_change_nothing():
     assert m.steps == 3
 
 
+def test_a_source_whose_first_steps_are_refused_is_not_in_the_memory():
+    naive, m = Naive(0), memory()
+    naive.chunk('sim', 2)
+    with pytest.raises(RecordError, match="'sim' sent episode 0 step 2"):
+        m.append(naive.chunk('sim', 2))
+    assert m.store.sources == [] and m.nbytes == 0
+    with pytest.raises(RecordError, match=r"'sim', which sent no steps; sources: \[\]"):
+        m.apply(labels('sim', [(0, 0, 2)], np.ones(2)))
+
+
+def test_segments_keep_their_source_when_one_with_an_earlier_name_appears():
+    naive, m = Naive(0), memory()
+    m.append(naive.chunk('b', 5))
+    m.score(score('b', 0, 0, DELAY, 1.5))
+    before = m.segments.batch(m.segments.ids())
+    m.append(naive.chunk('a', 3))
+    ids = m.segments.ids()
+    assert [source for source, *_ in m.segments.spans(ids)] == ['b']
+    np.testing.assert_array_equal(m.segments.batch(ids).observations, before.observations)
+
+
 def test_steps_whose_first_observation_is_another_are_refused():
     naive, m = Naive(0), memory()
     m.append(naive.chunk('sim', 3))
