@@ -9,6 +9,8 @@ equals it up to rounding.
 Shapes: B = batch, O = observation size, A = action size, H = width of a hidden layer. A network is
 a stack of N networks, N = 1 (actor) or 2 (critics, targets): its layers are weights (N, in, out)
 and biases (N, 1, out), one after the other; its activations are (N, B, H).
+
+The formula beside its symbols: docs/methods.md#sac.
 """
 
 from collections.abc import Callable, Sequence

@@ -30,6 +30,8 @@ had. That the published code does any of this in the same way is not claimed. De
 
 Shapes: B = batch of steps, S = segments, L = steps of the longest, O, A = sizes of observation and
 action.
+
+The formula beside its symbols: docs/methods.md#hc.
 """
 
 import copy

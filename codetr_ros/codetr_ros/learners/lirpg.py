@@ -38,6 +38,8 @@ reward with value of R, and the meta-gradient goes through that bound and throug
 normalisation; eta and theta move together after each minibatch.
 
 Shapes: T = steps of the phase, B = steps of a minibatch, O, A = sizes of observation and action.
+
+The formula beside its symbols: docs/methods.md#lirpg.
 """
 
 import math

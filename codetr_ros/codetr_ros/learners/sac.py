@@ -8,6 +8,8 @@ through exp.
 Shapes: B = batch, O = observation size, A = action size, H = width of a hidden layer. The two
 critics are a stack: each of their weights has a leading dimension of 2, and one batched product
 serves both.
+
+The formula beside its symbols: docs/methods.md#sac.
 """
 
 import math

@@ -111,7 +111,10 @@ class Segments:
         return self.score_scale() if kind == 'rms' else 1.0
 
     def score_scale(self) -> float:
-        """Root mean square of all composite rewards per step; 1 where that is 0."""
+        """Root mean square of all composite rewards per step, the scale c; 1 where that is 0.
+
+        The formula: docs/methods.md#scale.
+        """
         squares = [s.scored.per_step() ** 2 for s in self._store.sources]
         values = np.concatenate(squares) if squares else np.empty(0)
         scale = float(np.sqrt(values.mean())) if len(values) else 0.0

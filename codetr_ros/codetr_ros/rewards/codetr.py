@@ -1,4 +1,7 @@
-"""CoDeTr: a reward transformer, trained to make up composite rewards from step rewards."""
+"""CoDeTr: a reward transformer, trained to make up composite rewards from step rewards.
+
+The formula beside its symbols: docs/methods.md#codetr.
+"""
 
 from collections.abc import Iterator
 from typing import ClassVar

@@ -21,6 +21,8 @@ is the better guide to the paper's table:
 
 Labels are in [0, 1] by definition, so `target_scale` and `reward_unit` do not touch them. That
 they cannot be negative makes every step of survival worth something, whatever the scores say.
+
+The formula beside its symbols: docs/methods.md#ircr.
 """
 
 from collections.abc import Mapping

@@ -4,6 +4,8 @@ It is a control, no published method: CoDeTr without a transformer and without w
 does as well, no step's reward depended on the steps around it. Sizes, learning rate and weight
 decay are decided here, after the reward network of RRD; composite rewards, target scale,
 segments, batch and number of gradient steps are CoDeTr's.
+
+The formula beside its symbols: docs/methods.md#mlp.
 """
 
 import itertools

@@ -32,6 +32,8 @@ hand:
   learning rate and number of gradient steps are by the settings `codetr`, so that RBT is compared
   with CoDeTr and not with other settings. There it is one head, an unscaled attention, a learning
   rate of 1e-4 that rises to 1e-3 and falls again, and four times as many gradient steps.
+
+The formula beside its symbols: docs/methods.md#rbt.
 """
 
 from collections.abc import Iterator

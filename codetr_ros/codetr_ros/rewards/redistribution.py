@@ -3,6 +3,8 @@
 All of them state their rewards in the unit of the reward transformer (`target_scale`,
 `reward_unit`), so that what a learner makes of them differs by how rewards are distributed and by
 nothing else.
+
+The rules in a table: docs/methods.md#fixed-rules.
 """
 
 from abc import abstractmethod

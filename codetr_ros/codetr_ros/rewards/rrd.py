@@ -24,6 +24,8 @@ What differs from the published code:
 The published code has the network (input s, a, s - s'; Xavier weights), the learning rate, four
 subsequences of K = 64 steps, and draws trajectories in proportion to their lengths, as here. That
 its Xavier weights are uniform, as here, is inferred; the paper itself was not at hand.
+
+The formula beside its symbols: docs/methods.md#rrd.
 """
 
 from collections.abc import Iterator

@@ -9,6 +9,8 @@ softmax attention (Eqs. 6 and 7), so that the weights of m steps sum to m.
 Shapes: B = batch, L = steps of the longest window, N = tokens (2 L or L), H = heads, d = the
 embedding's, O and A = observation and action size. Windows are padded on the right: a causal token
 never sees the padding behind it, and the attention within the sequence is masked.
+
+The formula beside its symbols: docs/methods.md#codetr.
 """
 
 import math

@@ -2,6 +2,8 @@
 
 An observer, of a run in process while it goes on, of a run over topics by its bag. Nothing comes
 back from it: neither learner nor reward model can see what it sees.
+
+What is measured: docs/methods.md#reward-recovery.
 """
 
 import numpy as np

@@ -5,6 +5,8 @@ and is scored by the same formula. All of it is float64. How certain each formul
 supplement states the types and beta, not all of the formulas; signed squares follow from the
 negative scores in its Table 2, and the softmax reading of Max from its word "scaling parameter".
 The other maxima are variants by name.
+
+All formulas in a table: docs/methods.md#composite-rewards.
 """
 
 # ruff: noqa: ARG001  (every formula takes the same arguments, so that one is as good as another)
@@ -109,12 +111,11 @@ def composite(name: str, rewards: F64, beta: float, delay: int) -> float:
 
 def perfect_score(name: str, beta: float, delay: int, horizon: int, r_max: float) -> float:
     """What an agent that earns r_max at every step collects in an episode: the unit of scores
-    (A.3).
+    (A.3; docs/methods.md#score).
 
     It is the composite reward of a full segment, horizon / delay times. That number of segments is
     not rounded where the delay does not divide the horizon, although the episode's shorter last
-    segment is
-    scored: a maximum can then exceed a score of 1.
+    segment is scored: a maximum can then exceed a score of 1.
 
     Args:
         name: one of `COMPOSITES`.
