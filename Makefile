@@ -10,13 +10,14 @@ BENCH ?= simulator sac_updates codetr_speed nodes throughput recording_overhead 
 unexport PYTHONPATH PYTHONHOME LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE AMENT_PREFIX_PATH
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test lint format bench clean
+.PHONY: help setup train test lint format docs bench clean
 
 help:
 	@echo "make train    set up what is missing, then learn the default task and watch it    (codetr train)"
 	@echo "make test     set up what is missing, then run all tests, lint and types included (pytest)"
 	@echo "make lint     lint, format and type checks alone"
 	@echo "make bench    measure how fast everything is, some three hours on a machine that does nothing else (benchmarks/)"
+	@echo "make docs     build the pages of docs/ as a site, API reference included, into site/"
 	@echo "make format   put the code into the house format"
 	@echo "make setup    the set-up alone, into $(VENV)"
 	@echo "make clean    remove $(VENV) and every cache; runs are kept"
@@ -45,6 +46,10 @@ lint: setup
 format: setup
 	@$(VENV)/bin/ruff format .
 	@$(VENV)/bin/ruff check --fix .
+
+docs: setup
+	@NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict --quiet
+	@echo "site/index.html"
 
 bench: setup
 	@for script in $(BENCH); do echo "== benchmarks/$$script.py"; $(VENV)/bin/python benchmarks/$$script.py || exit 1; done
