@@ -137,10 +137,10 @@ def run_ours(
     started = time.monotonic()
     summary = Summary(settings, 'benchmark', True)
     reports = in_process.run(settings, 'benchmark', observe=summary.receive)
-    evaluations = summary.build(reports, None, False, None)['evaluations']
+    evaluations = summary.build(reports, None, False, None).evaluations
     packages = ('torch', 'gymnasium', 'mujoco')
     return {
-        'evaluations': [e for e in evaluations if e['step'] >= warmup],
+        'evaluations': [e.model_dump(mode='json') for e in evaluations if e.step >= warmup],
         'wall_s': time.monotonic() - started,
         'versions': {name: version(name) for name in packages},
     }

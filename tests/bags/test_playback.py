@@ -7,7 +7,7 @@ import pytest
 
 from codetr_ros.bags import causal as causal_module
 from codetr_ros.bags.causal import causal
-from codetr_ros.bags.playback import Item, Pace, Playback, PlayError, items, survey
+from codetr_ros.bags.playback import Item, Pace, Playback, PlaybackReport, PlayError, items, survey
 from codetr_ros.bags.reader import Bag
 from codetr_ros.records import (
     Commit,
@@ -98,7 +98,7 @@ def test_with_nobody_to_wait_for_everything_goes_out_in_the_order_of_the_bag():
     p = playback(records, learners=())
     found = until_it_waits(p.work())
     assert found == [r for r in records if not isinstance(r, RunSpec)]
-    assert p.report() == {'counters': {'steps': 60}, 'phases': 3}
+    assert p.report() == PlaybackReport(counters={'steps': 60}, phases=3)
 
 
 def test_what_belongs_to_no_phase_that_is_played_is_left_out_and_counted():
@@ -108,7 +108,7 @@ def test_what_belongs_to_no_phase_that_is_played_is_left_out_and_counted():
     found = until_it_waits(p.work())
     assert phases_of(found) == steps_of(found) == [0, 1]
     assert sum(isinstance(r, CompositeReward) for r in found) == 8
-    assert p.report()['counters'] == {
+    assert p.report().counters == {
         'steps': 40,
         'transitions of no phase that is played': 4,
         'composite_rewards of no phase that is played': 4,
@@ -160,7 +160,7 @@ def test_what_was_recorded_twice_is_played_once():
     p = playback([*records[: at + 1], chunk, *records[at + 1 :]], learners=())
     found = until_it_waits(p.work())
     assert sum(r is chunk for r in found) == 1
-    assert p.report()['counters']['transitions recorded twice'] == 1
+    assert p.report().counters['transitions recorded twice'] == 1
 
 
 def test_steps_recorded_before_the_commit_that_permitted_them_come_after_it():

@@ -68,7 +68,7 @@ def test_the_random_policy_and_every_version_due_are_evaluated_once(whole):
 def test_it_has_finished_only_when_the_last_version_is_evaluated(whole):
     settings, finished, _ = whole
     assert finished.finished
-    assert finished.report()['counters'] == {'episodes': 8, 'evaluations': 4, 'steps': 1600}
+    assert finished.report().counters == {'episodes': 8, 'evaluations': 4, 'steps': 1600}
     evaluator, _ = evaluate(settings, [permit(k) for k in range(6)])
     assert not evaluator.finished
     evaluator = Evaluator(run_spec(settings), settings, 'evaluate')

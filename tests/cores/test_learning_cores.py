@@ -110,7 +110,7 @@ def test_a_warm_up_without_scores_delays_the_fit_and_freezes_no_scale():
     (metrics,) = [r for r in said if isinstance(r, Metrics) and r.phase == 1]
     values = dict(zip(metrics.names, metrics.values, strict=True))
     assert values['target_scale'] == 0 and values['gradient_steps'] == 0
-    assert core.report()['counters'] == {'gradient steps skipped, nothing scored': 5}
+    assert core.report().counters == {'gradient steps skipped, nothing scored': 5}
 
 
 def test_labels_travel_in_parts_well_below_the_shared_memory_segment():
@@ -151,12 +151,12 @@ def test_the_learner_waits_for_all_parts_of_the_labels_before_it_learns():
     permitted = [r for r in slices(work) if isinstance(r, Policy)]
     assert [p.phase for p in permitted] == [1]
     core.receive(step_rewards(phase=1, parts=2, part=1))
-    assert slices(work) == [] and core.report()['updates'] == 0
+    assert slices(work) == [] and core.report().updates == 0
     core.receive(step_rewards(phase=1, parts=2, part=0, first_steps=np.array([7], np.uint32)))
     said = slices(work)
     (permit,) = [r for r in said if isinstance(r, Policy)]
     assert (permit.phase, permit.version, permit.random) == (2, 1, False)
-    assert core.report()['updates'] == settings.phase_steps
+    assert core.report().updates == settings.phase_steps
     (metrics,) = [r for r in said if isinstance(r, Metrics)]
     assert dict(zip(metrics.names, metrics.values, strict=True))['labelled_steps'] == 10
 
@@ -181,7 +181,7 @@ def test_nothing_is_learnt_while_nothing_is_labelled_and_that_is_counted():
         )
     )
     slices(work)
-    assert core.report()['counters']['updates skipped, nothing labelled'] == 200
+    assert core.report().counters['updates skipped, nothing labelled'] == 200
 
 
 @pytest.mark.parametrize(
@@ -222,8 +222,8 @@ def test_memory_and_updates_of_a_run_add_up():
     seen = []
     reports = in_process.run(settings, 'run', observe=seen.append)
     learning = settings.phases - settings.warmup_phases + 1
-    assert reports['learner']['updates'] == learning * settings.phase_steps
-    assert reports['learner']['memory']['steps'] <= settings.memory_steps
+    assert reports['learner'].updates == learning * settings.phase_steps
+    assert reports['learner'].memory.steps <= settings.memory_steps
     versions = [r.version for r in seen if isinstance(r, Policy)]
     assert versions == [-1, *range(settings.phases)]
     assert [r.steps.sum() for r in seen if isinstance(r, Policy)] == [200] * 6 + [0]
@@ -245,9 +245,7 @@ def test_what_raises_while_watching_ends_the_run_with_reports(tmp_path):
 def test_the_oracle_learns_from_the_true_rewards_and_only_it():
     """The digest of a run with the oracle changes with the true rewards' unit, as it must."""
     digests = {
-        unit: in_process.run(tiny(method='true', reward_unit=unit), 'run')['learner'][
-            'policy_sha256'
-        ]
+        unit: in_process.run(tiny(method='true', reward_unit=unit), 'run')['learner'].policy_sha256
         for unit in ('raw', 'scaled')
     }
     assert digests['raw'] != digests['scaled']
@@ -272,7 +270,7 @@ def test_no_first_gradient_steps_still_means_gradient_steps_later():
     settings = tiny(codetr__first_gradient_steps=0)
     reports = in_process.run(settings, 'run')
     later = settings.phases - settings.warmup_phases
-    assert reports['reward']['gradient_steps'] == later * settings.codetr.gradient_steps
+    assert reports['reward'].gradient_steps == later * settings.codetr.gradient_steps
 
 
 def test_window_labelling_gives_every_step_a_label_in_the_place_it_belongs():

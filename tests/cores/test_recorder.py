@@ -72,7 +72,7 @@ def test_what_arrives_twice_is_counted_once():
     r = recorder()
     r.receive(transitions())
     r.receive(transitions())
-    assert r.report()['duplicated'] == {'transitions': 1}
+    assert r.report().duplicated == {'transitions': 1}
 
 
 def test_every_simulator_must_have_ended_its_share():
@@ -111,9 +111,9 @@ def test_steps_that_come_before_their_announcement_are_checked_when_it_has_come(
     r.receive(transitions(observations=nan))
     r.receive(transitions())
     r.receive(transitions(sequence=1, first_step=5))
-    assert r.report()['duplicated'] == {}
+    assert r.report().duplicated == {}
     r.receive(task_spec())
-    assert r.report()['refused'] == {'transitions': 1}
-    assert r.report()['duplicated'] == {}
+    assert r.report().refused == {'transitions': 1}
+    assert r.report().duplicated == {}
     with pytest.raises(RecordError, match='2 is the next'):
         r.receive(transitions(sequence=5))

@@ -356,7 +356,7 @@ def test_a_simulator_has_finished_after_a_policy_without_steps():
     simulator.receive(permit(2, steps=0))  # with overlap a second one follows
     simulator.close()
     simulator.close()
-    counters = simulator.report()['counters']
+    counters = simulator.report().counters
     assert counters == {'chunks': 1, 'steps': 200, 'scores': 29, 'episodes': 1, 'phases': 1}
 
 
@@ -432,7 +432,7 @@ def test_counts_are_those_of_all_environments():
         if said is None:
             break
     simulator.close()
-    counters = simulator.report()['counters']
+    counters = simulator.report().counters
     assert counters == {'chunks': 2, 'steps': 400, 'scores': 58, 'episodes': 2, 'phases': 1}
 
 

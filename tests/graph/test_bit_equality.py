@@ -33,7 +33,7 @@ def by_calls(settings: Settings) -> dict[str, Any]:
     """The summary of a run in this process, which is not even that of `codetr train`."""
     summary = Summary(settings, 'calls', True)
     reports = in_process.run(settings, 'calls', observe=summary.receive)
-    return summary.build(reports, None, False, None)
+    return summary.build(reports, None, False, None).model_dump(mode='json')
 
 
 def check_same(topics: dict[str, Any], calls: dict[str, Any]) -> None:

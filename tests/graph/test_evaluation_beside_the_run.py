@@ -28,4 +28,4 @@ def test_an_evaluator_that_stands_still_delays_no_phase_and_makes_up_for_it(tmp_
     assert said['lost'] == said['refused'] == {}
     undisturbed = in_process.run(settings, 'calls')
     for name, digest in (('learner', 'policy_sha256'), ('reward', 'reward_model_sha256')):
-        assert nodes.report(name)[digest] == undisturbed[name][digest]
+        assert nodes.report(name)[digest] == getattr(undisturbed[name], digest)

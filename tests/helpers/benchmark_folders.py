@@ -10,6 +10,9 @@ import yaml
 from codetr_ros.benchmark import spec
 from codetr_ros.benchmark.folder import Folder, session
 from codetr_ros.benchmark.spec import Cell
+from codetr_ros.runs import run_summary
+from codetr_ros.runs.run_summary import Evaluation, RewardRecovery, RunSummary
+from codetr_ros.runs.summary import Summary
 
 Score = Callable[[Cell], float | str | None]
 """The score of a cell, or why it failed, or None where it has not been run."""
@@ -57,26 +60,41 @@ def _end(folder: Folder, cell: Cell, said: float | str) -> None:
     folder.ending(cell.name).write_text(json.dumps(ending))
     if failed:
         return
-    steps = [1000, 2000, 3000]
-    summary = {
-        'settings_hash': hashed,
-        'steps': 3000,
-        'steps_planned': 3000,
-        'interrupted': False,
-        'failure': None,
-        'final_score': said,
-        'final_true_return': 1000 * said,
-        'wall_s': 12.5,
-        'evaluations': [
-            {'step': s, 'score_mean': said * s / 3000, 'true_return_mean': said * s / 3}
-            for s in steps
-        ],
-        'reward_recovery': [
-            {'step': s, 'pearson': said, 'within': said / 2, 'spearman': None, 'steps': s}
-            for s in steps
-        ]
-        if cell.settings.method == 'codetr'
-        else [],
-    }
     folder.run(cell.name).mkdir()
-    (folder.run(cell.name) / 'summary.json').write_text(json.dumps(summary))
+    run_summary.write(folder.run(cell.name), _summary(cell, said))
+
+
+def _summary(cell: Cell, score: float) -> RunSummary:
+    """Of a run whose score grew to this one."""
+    empty = Summary(cell.settings, 'run', in_process=True).build({})
+    steps = [1000, 2000, 3000]
+    evaluations = [
+        Evaluation(
+            step=step,
+            version=step // 1000 - 1,
+            true_return_mean=score * step / 3,
+            true_return_std=0.0,
+            true_return_min=0.0,
+            true_return_max=0.0,
+            composite_return_mean=0.0,
+            score_mean=score * step / 3000,
+            score_std=0.0,
+            length_mean=1.0,
+            episodes=2,
+        )
+        for step in steps
+    ]
+    recovery = [
+        RewardRecovery(step=step, pearson=score, within=score / 2, spearman=None, steps=step)
+        for step in steps
+    ]
+    return empty.model_copy(
+        update={
+            'steps': 3000,
+            'final_score': score,
+            'final_true_return': 1000 * score,
+            'wall_s': 12.5,
+            'evaluations': evaluations,
+            'reward_recovery': recovery if cell.settings.method == 'codetr' else [],
+        }
+    )

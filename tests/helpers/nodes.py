@@ -2,6 +2,7 @@
 namespace that hears everything and can say anything.
 """
 
+import json
 import os
 import signal
 import time
@@ -91,7 +92,7 @@ class Nodes:
     def report(self, name: str) -> dict[str, Any]:
         """The report that a node has left."""
         role = self._commands[name].role
-        return run_folder.read_report(run_folder.report_path(self.folder, role, name))
+        return json.loads(run_folder.report_path(self.folder, role, name).read_text())
 
     def __enter__(self) -> 'Nodes':
         return self

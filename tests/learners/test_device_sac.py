@@ -188,12 +188,12 @@ def test_a_run_with_its_memory_on_a_device_finishes_and_its_checkpoint_loads(
     monkeypatch.setitem(registry.METHODS, 'codetr', FromLabelsOnDevice)
     chosen = tiny(evaluate_every=0, simulators=2, device=device)
     report = in_process.run(chosen, 'a_run', tmp_path)['learner']
-    assert report['finished'] and report['updates'] > 0
+    assert report.finished and report.updates > 0
     state, meta = checkpoints.load(checkpoints.latest(tmp_path / 'checkpoints', 'learner'))
     flat = FlatSAC(meta['observation_size'], meta['action_size'], chosen.sac, 1)
     flat.load_state({name: t for name, t in state.items() if not name.startswith('labels/')})
-    assert checkpoints.digest(flat.actor.state_dict()) == report['policy_sha256']
-    assert flat.state()['critic_adam.step.0'] == report['updates']
+    assert checkpoints.digest(flat.actor.state_dict()) == report.policy_sha256
+    assert flat.state()['critic_adam.step.0'] == report.updates
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason='there is a GPU here')

@@ -337,7 +337,7 @@ def test_the_learner_itself_takes_the_scores_and_no_labels() -> None:
     said = [next(work) for _ in range(4)]
     permit = next(r for out in said for r in out or () if isinstance(r, Policy))
     assert (permit.phase, permit.version) == (1, 0) and '"segment_steps":5' in permit.network
-    assert core.report()['updates'] == 10
+    assert core.report().updates == 10
 
 
 def test_nothing_is_learnt_while_nothing_is_scored_and_that_is_counted() -> None:
@@ -351,7 +351,7 @@ def test_a_run_needs_no_reward_node_and_its_policy_changes(history: str) -> None
     seen = []
     settings = tiny(method='hc', hc__history=history, hc__width=8, hc__segments=8, steps=800)
     reports = in_process.run(settings, 'run', observe=seen.append)
-    assert 'reward' not in reports and reports['learner']['updates'] == 600
+    assert 'reward' not in reports and reports['learner'].updates == 600
     assert not any(isinstance(record, StepRewards) for record in seen)
     weights = {record.weights for record in seen if isinstance(record, Policy)}
     assert len(weights) == 4  # random ones have none; then one of each learning phase

@@ -1,12 +1,12 @@
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from codetr_ros.config import Settings
 from codetr_ros.cores import in_process
 from codetr_ros.records import Record
+from codetr_ros.runs.reports import NodeReport
 from helpers.builders import tiny
 from helpers.foreign_bags import write
 
@@ -17,7 +17,7 @@ class Run:
 
     settings: Settings
     records: list[Record]
-    reports: dict[str, Any]
+    reports: dict[str, NodeReport]
     bag: Path
 
 

@@ -26,7 +26,7 @@ def fit(bag: Path, out: Path, *flags: str, code: int = 0) -> dict[str, Any]:
 def test_folding_the_bag_ends_with_the_weights_and_labels_of_the_run(a_run, tmp_path):
     said = fit(a_run.bag, tmp_path / 'out')
 
-    assert said[DIGEST] == a_run.reports['reward'][DIGEST]
+    assert said[DIGEST] == a_run.reports['reward'].reward_model_sha256
     made = sum(len(r.lengths) for r in a_run.records if isinstance(r, StepRewards))
     assert said['recorded_labels'] == {'same': made, 'other': 0}
     assert said['phases'] == a_run.settings.phases
@@ -65,7 +65,7 @@ def test_topics_may_have_been_recorded_in_another_order(a_run, tmp_path):
 
     said = fit(bag, tmp_path / 'out')
 
-    assert said[DIGEST] == a_run.reports['reward'][DIGEST]
+    assert said[DIGEST] == a_run.reports['reward'].reward_model_sha256
     made = sum(len(r.lengths) for r in records if isinstance(r, StepRewards))
     assert said['recorded_labels'] == {'same': made, 'other': 0}
     assert said['skipped'] == {}
@@ -85,7 +85,7 @@ def test_a_setting_that_the_run_did_not_have_is_said_and_teaches_something_else(
     said = fit(a_run.bag, tmp_path / 'out', '--codetr.learning-rate', '0.002')
 
     assert said['changed_settings'] == {'codetr.learning_rate': 0.002}
-    assert said[DIGEST] != a_run.reports['reward'][DIGEST]
+    assert said[DIGEST] != a_run.reports['reward'].reward_model_sha256
     assert said['recorded_labels']['same'] == 0
 
 
@@ -141,7 +141,7 @@ def test_two_runs_in_a_bag_must_be_told_apart(a_run, tmp_path, capsys):
     fit(bag, tmp_path / 'out', '--run', 'mine', code=2)
     assert "holds no run 'mine'; it holds calls, other" in capsys.readouterr().err
     said = fit(bag, tmp_path / 'chosen', '--run', 'calls')
-    assert said[DIGEST] == a_run.reports['reward'][DIGEST]
+    assert said[DIGEST] == a_run.reports['reward'].reward_model_sha256
 
 
 def test_a_bag_that_does_not_say_how_its_run_learnt_is_refused(a_run, tmp_path, capsys):

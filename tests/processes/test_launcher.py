@@ -15,6 +15,8 @@ from codetr_ros.processes.launcher import Command, LaunchError, Node, Processes
 from codetr_ros.processes.supervise import Interrupts, Silence, supervise, why_it_gave_up
 from codetr_ros.records import Commit, Presence
 from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs import reports
+from codetr_ros.runs.reports import NodeReport
 from helpers.executables import prefix
 
 PATIENCE = 20.0  # seconds after which a test gives up; nothing waits for it to pass
@@ -272,7 +274,8 @@ def test_a_process_that_ends_well_but_too_early_stops_the_run(
     tmp_path: Path, processes: Processes
 ) -> None:
     (tmp_path / 'nodes').mkdir()
-    run_folder.write_report(tmp_path, 'learner', 'learner', {'finished': False, 'error': 'tired'})
+    tired = NodeReport(role='learner', name='learner', finished=False, error='tired')
+    reports.write(run_folder.report_path(tmp_path, 'learner', 'learner'), tired)
     start(
         processes,
         tmp_path,
@@ -297,7 +300,8 @@ def test_a_process_without_a_report_is_named(tmp_path: Path, processes: Processe
     (node,) = processes.nodes
 
     assert why_it_gave_up(node, tmp_path) == 'learner ended without a report'
-    run_folder.write_report(tmp_path, 'learner', 'learner', {'finished': True})
+    report = NodeReport(role='learner', name='learner', finished=True)
+    reports.write(run_folder.report_path(tmp_path, 'learner', 'learner'), report)
     assert why_it_gave_up(node, tmp_path) is None
 
 

@@ -17,9 +17,9 @@ def test_a_frozen_model_labels_as_it_was_saved_and_each_segment_once(tmp_path):
     before, _ = trained(tmp_path)
     core, said = served(checkpoints.latest(tmp_path, 'reward'), frozen=True, phases=4)
 
-    digest = before.report()['reward_model_sha256']
-    assert core.report()['reward_model_sha256'] == digest
-    assert core.report()['started_from'] == {
+    digest = before.report().reward_model_sha256
+    assert core.report().reward_model_sha256 == digest
+    assert core.report().started_from.model_dump() == {
         'checkpoint': str(tmp_path / 'reward-000002'),
         'reward_model_sha256': digest,
         'frozen': True,
@@ -38,7 +38,7 @@ def test_a_frozen_rule_keeps_what_it_knew_of_scores(tmp_path):
     core, _ = served(checkpoints.latest(tmp_path, 'reward'), frozen=True, phases=5, method='ircr')
     live, _ = served(checkpoints.latest(tmp_path, 'reward'), phases=5, method='ircr')
 
-    digests = [c.report()['reward_model_sha256'] for c in (before, core, live)]
+    digests = [c.report().reward_model_sha256 for c in (before, core, live)]
     assert digests[0] == digests[1] != digests[2]
 
 
@@ -46,16 +46,16 @@ def test_a_live_model_goes_on_learning_from_where_it_was_saved(tmp_path):
     before, _ = trained(tmp_path)
     core, said = served(checkpoints.latest(tmp_path, 'reward'), phases=2)
 
-    steps = before.report()['gradient_steps']
+    steps = before.report().gradient_steps
     assert steps == 7
-    assert core.report()['gradient_steps'] == steps + 5
+    assert core.report().gradient_steps == steps + 5
     assert said[1][0].version == steps + 5
     assert core.method.target_scale == before.method.target_scale
-    assert core.report()['reward_model_sha256'] != before.report()['reward_model_sha256']
+    assert core.report().reward_model_sha256 != before.report().reward_model_sha256
 
 
 def test_without_a_checkpoint_nothing_is_other_than_it_was(tmp_path):
-    assert 'started_from' not in trained(tmp_path)[0].report()
+    assert trained(tmp_path)[0].report().started_from is None
     with pytest.raises(RewardModelError, match='frozen = true without a checkpoint'):
         served(None, frozen=True)
 

@@ -1,5 +1,6 @@
 """What was published and did not arrive: asked for again, counted, and not waited for in vain."""
 
+import json
 from collections import Counter
 
 import numpy as np
@@ -60,7 +61,7 @@ def test_a_phase_that_a_node_lacks_is_fetched_from_the_recorder_and_the_loss_is_
         said = output(deaf)
     assert deaf.returncode == 0, said
     assert 'phase 0 is incomplete: asking the recorder for it' in said
-    report = run_folder.read_report(run_folder.report_path(tmp_path, 'reward', 'reward'))
+    report = json.loads(run_folder.report_path(tmp_path, 'reward', 'reward').read_text())
     assert report['fetched'] == {'transitions': 1}
     assert report['lost'] == {}
     assert report['duplicated'] == {'composite_rewards': 1}
@@ -195,7 +196,7 @@ def test_what_the_core_has_not_taken_is_not_sent_again(play, tmp_path):
     with AnyReader([tmp_path / 'bag']) as bag:
         runs = {bag.deserialize(raw, c.msgtype).run_id for c, _, raw in bag.messages()}
     assert runs == {'run'}
-    report = run_folder.read_report(run_folder.report_path(tmp_path, 'record', 'record'))
+    report = json.loads(run_folder.report_path(tmp_path, 'record', 'record').read_text())
     assert report['refused'] == {'transitions': 3, 'step_rewards': 1}
     assert report['recorded']['transitions'] == 3  # of this run: one sound, two not
     assert 'step_rewards' not in report['recorded']

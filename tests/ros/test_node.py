@@ -1,5 +1,6 @@
 """Nodes as processes, among peers that this test plays itself over real topics."""
 
+import json
 import signal
 import time
 
@@ -36,7 +37,7 @@ def test_a_recorder_commits_a_phase_and_keeps_every_byte_of_it(play, tmp_path):
         counts = {c.topic: c.msgcount for c in bag.connections if c.msgcount}
     assert read['/r/transitions'].observations.tobytes() == transitions().observations.tobytes()
     assert read['/r/step_rewards'].labels.tobytes() == labels.tobytes()
-    report = run_folder.read_report(run_folder.report_path(tmp_path, 'record', 'record'))
+    report = json.loads(run_folder.report_path(tmp_path, 'record', 'record').read_text())
     assert report['recorded'] == {topic.removeprefix('/r/'): n for topic, n in counts.items()}
     assert report['recorded'] == {
         'run': 1, 'task': 1, 'policy': 1, 'transitions': 1, 'composite_rewards': 1,
@@ -56,7 +57,7 @@ def test_what_was_published_and_never_came_is_reported_as_lost(play, tmp_path):
         play.say()
         said = output(node)
     assert 'gave up after 8 s: waits for the end of nobody and for 2 of step_rewards' in said
-    report = run_folder.read_report(run_folder.report_path(tmp_path, 'record', 'record'))
+    report = json.loads(run_folder.report_path(tmp_path, 'record', 'record').read_text())
     assert report['lost'] == {'step_rewards': 2}
 
 

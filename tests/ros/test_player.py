@@ -1,5 +1,6 @@
 """The player among real nodes that it waits for, or whose trouble it sees."""
 
+import json
 import os
 import signal
 import subprocess
@@ -61,7 +62,7 @@ def test_a_phase_that_a_node_lacks_is_sent_again(ros_domain, tmp_path):
     with process('deaf', f'folder:={tmp_path}') as deaf, player(bag) as node:
         said, heard = output(node), output(deaf)
     assert (node.returncode, deaf.returncode) == (0, 0), said + heard
-    report = run_folder.read_report(run_folder.report_path(tmp_path, 'reward', 'reward'))
+    report = json.loads(run_folder.report_path(tmp_path, 'reward', 'reward').read_text())
     assert report['fetched'] == {'transitions': 4}
     assert '/r/reward lacks something of phase 0: sending it again' in said
     assert said.index('phase 0 is played') < said.index('everything is played and learnt from')

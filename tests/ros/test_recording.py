@@ -1,5 +1,6 @@
 """The recorder node: what is committed is on the disk, and a full disk ends the run."""
 
+import json
 import os
 
 import numpy as np
@@ -85,7 +86,7 @@ def test_a_disk_that_runs_full_ends_the_run_while_the_bag_can_be_closed(play, tm
         assert {'/r/transitions', '/r/composite_rewards'} <= set(recorded)
         assert '/r/commits' not in recorded
         assert (disk / 'run' / 'bag' / 'metadata.yaml').is_file()
-        report = run_folder.read_report(run_folder.report_path(disk / 'run', 'record', 'record'))
+        report = json.loads(run_folder.report_path(disk / 'run', 'record', 'record').read_text())
         assert 'fewer than the 1.0 MB' in report['error']
 
 

@@ -20,6 +20,7 @@ from codetr_ros.ros.node import CoreNode
 from codetr_ros.ros.signals import Stop
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.checkpoints import CheckpointError
+from codetr_ros.runs.reports import CoreReport
 from codetr_ros.simulation.composite import CompositeError
 from codetr_ros.simulation.tasks import TaskError
 from helpers.builders import tiny
@@ -137,7 +138,7 @@ class Core:
         self.saved = True
 
     def report(self):
-        return {}
+        return CoreReport()
 
 
 class Begun(CoreNode):

@@ -220,4 +220,4 @@ def test_the_oracles_labels_are_the_truth_and_nobody_learns_from_the_comparison(
     assert all(row['steps'] > 0.9 * row['step'] for row in recovery.rows)
     # its rewards hardly vary: 1 for each step but the last of an episode
     assert all(row['pearson'] == pytest.approx(1) for row in recovery.rows)
-    assert watched['learner']['policy_sha256'] == alone['learner']['policy_sha256']
+    assert watched['learner'].policy_sha256 == alone['learner'].policy_sha256

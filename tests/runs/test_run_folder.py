@@ -5,7 +5,9 @@ import pytest
 
 from codetr_ros import config
 from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs import reports as node_reports
 from codetr_ros.runs.folder import RunFolderError
+from codetr_ros.runs.reports import NodeReport
 from codetr_ros.system.files import atomic_write
 
 
@@ -102,10 +104,13 @@ def test_a_folder_that_no_run_has_made_is_refused(tmp_path: Path) -> None:
 
 
 def test_node_reports_are_found_by_role_and_name(tmp_path: Path) -> None:
-    run_folder.write_report(tmp_path, 'sim', '/run_x/sim_2', {'published': {'task': 1}})
-    run_folder.write_report(tmp_path, 'learner', 'learner', {'name': 'given', 'finished': True})
+    sim = NodeReport(role='sim', name='/run_x/sim_2', published={'task': 1})
+    node_reports.write(run_folder.report_path(tmp_path, 'sim', '/run_x/sim_2'), sim)
+    learner = NodeReport(role='learner', name='given', finished=True)
+    node_reports.write(run_folder.report_path(tmp_path, 'learner', 'learner'), learner)
 
-    reports = run_folder.read_reports(tmp_path)
+    read = node_reports.read_all(tmp_path)
+    reports = {name: report.model_dump(exclude_unset=True) for name, report in read.items()}
 
     assert reports == {
         'sim-sim_2': {'role': 'sim', 'name': '/run_x/sim_2', 'published': {'task': 1}},
@@ -116,8 +121,9 @@ def test_node_reports_are_found_by_role_and_name(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(('text', 'said'), [('{', 'is not JSON'), ('[1]', 'holds list')])
 def test_a_damaged_node_report_is_refused_by_name(tmp_path: Path, text: str, said: str) -> None:
-    path = run_folder.write_report(tmp_path, 'sim', 'sim', {})
+    path = run_folder.report_path(tmp_path, 'sim', 'sim')
+    path.parent.mkdir()
     path.write_text(text)
 
     with pytest.raises(RunFolderError, match=rf'{path} {said}'):
-        run_folder.read_reports(tmp_path)
+        node_reports.read_all(tmp_path)

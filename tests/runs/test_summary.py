@@ -14,9 +14,11 @@ from codetr_ros.cli import train
 from codetr_ros.config import Settings
 from codetr_ros.processes.supervise import Interrupts
 from codetr_ros.records import Commit, EpisodeResult, Presence, Record, metrics
+from codetr_ros.runs import facts, report, summary
 from codetr_ros.runs import folder as run_folder
-from codetr_ros.runs import report, summary
 from codetr_ros.runs.progress import Progress, duration
+from codetr_ros.runs.reports import NodeReport
+from codetr_ros.runs.run_summary import RewardRecovery, RunSummary
 from codetr_ros.runs.summary import Summary
 from helpers.bags import ours
 from helpers.builders import step_rewards
@@ -86,7 +88,7 @@ def a_run(settings: Settings = SETTINGS) -> list[Record]:
     return said
 
 
-REPORTS: dict[str, dict[str, Any]] = {
+REPORTED: dict[str, dict[str, Any]] = {
     'sim-sim': {
         'role': 'sim',
         'published': {'task': 1, 'transitions': 100},
@@ -117,9 +119,17 @@ REPORTS: dict[str, dict[str, Any]] = {
     },
     'record-record': {'role': 'record', 'recorded': {'transitions': 98}, 'bag': '/runs/x/bag'},
 }
+REPORTS = {
+    key: NodeReport.model_validate({'name': key} | known) for key, known in REPORTED.items()
+}
 
 
 def built(**changes: Any) -> dict[str, Any]:
+    """The summary as it is written."""
+    return run_summary(**changes).model_dump(mode='json')
+
+
+def run_summary(**changes: Any) -> RunSummary:
     clock = Clock()
     made = Summary(SETTINGS, 'r', in_process=False, clock=clock)
     for record in a_run():
@@ -209,18 +219,19 @@ def test_what_each_process_took_is_listed_this_one_included() -> None:
 
 
 def test_a_run_that_was_stopped_at_once_has_a_summary_too() -> None:
-    said = Summary(SETTINGS, 'r', in_process=True).build({}, interrupted=True)
+    made = Summary(SETTINGS, 'r', in_process=True).build({}, interrupted=True)
+    said = made.model_dump(mode='json')
 
     assert said['interrupted']
     assert (said['steps'], said['phases'], said['steps_planned']) == (0, 0, 2500)
     assert said['final_score'] is None
     assert said['policy_sha256'] is None
     assert said['bag'] is None
-    report.page(said, report.draw(said))
+    report.page(made, report.draw(made))
 
 
 def test_numbers_that_json_has_no_word_for_become_null() -> None:
-    assert summary.finite({'a': [1.0, float('nan')], 'b': (float('inf'),), 'c': 'x', 'd': 3}) == {
+    assert facts.finite({'a': [1.0, float('nan')], 'b': (float('inf'),), 'c': 'x', 'd': 3}) == {
         'a': [1.0, None],
         'b': [None],
         'c': 'x',
@@ -263,7 +274,7 @@ def test_several_nodes_of_a_role_get_columns_of_their_own() -> None:
 
 
 def test_the_report_is_one_file_that_holds_picture_tables_and_settings(tmp_path: Path) -> None:
-    report.write(tmp_path, built(failure='learner <died>'))
+    report.write(tmp_path, run_summary(failure='learner <died>'))
 
     page = (tmp_path / run_folder.REPORT).read_text()
     assert (tmp_path / run_folder.PICTURE).read_bytes().startswith(b'\x89PNG')
@@ -287,10 +298,13 @@ def test_the_report_is_one_file_that_holds_picture_tables_and_settings(tmp_path:
 )
 def test_the_report_tells_the_last_reward_recovery(rows, shown):
     names = 'step', 'pearson', 'within'
-    said = built() | {
-        'evaluations': [{'step': 4000, 'true_return_std': 1.0}],
-        'reward_recovery': [dict(zip(names, row, strict=True)) for row in rows],
-    }
+    made = run_summary()
+    recovery = [
+        RewardRecovery(spearman=None, steps=100, **dict(zip(names, row, strict=True)))
+        for row in rows
+    ]
+    last = made.evaluations[-1].model_copy(update={'step': 4000})
+    said = made.model_copy(update={'evaluations': [last], 'reward_recovery': recovery})
     assert dict(report.result_rows(said))['reward recovery'] == shown
 
 
@@ -308,14 +322,15 @@ def test_what_is_learnt_about_a_run_that_has_ended_takes_none_of_its_time():
     clock.now += 50
     made.end()
     clock.now += 7
-    assert made.build({})['wall_s'] == 50
+    assert made.build({}).wall_s == 50
 
 
 def test_a_summary_on_disk_is_what_was_built(tmp_path: Path) -> None:
-    said = built()
+    made = run_summary()
 
-    summary.write(tmp_path, said, 'step\n0\n')
+    summary.write(tmp_path, made, 'step\n0\n')
 
+    said = made.model_dump(mode='json')
     assert json.loads((tmp_path / 'summary.json').read_text()) == said
     assert (tmp_path / 'metrics.csv').read_text() == 'step\n0\n'
 
@@ -414,7 +429,7 @@ def test_durations_are_said_as_people_do(seconds: float, said: str) -> None:
 
 def told(made: Summary) -> tuple[dict[str, Any], str]:
     """What is said of a run, without what its process takes."""
-    return {k: v for k, v in made.build({}).items() if k != 'processes'}, made.metrics_csv()
+    return made.build({}).model_dump(exclude={'processes'}), made.metrics_csv()
 
 
 def test_a_run_that_is_told_twice_and_in_another_order_is_the_same_run():
@@ -436,7 +451,7 @@ def test_what_was_not_heard_is_taken_from_the_bag(tmp_path):
         heard.receive(record)
     for record in a_run()[3:]:
         late.receive(record)
-    assert late.build({})['random'] is None
+    assert late.build({}).random is None
     train._complete(late, tmp_path, progress, Interrupts())
     assert told(late) == told(heard)
     assert stream.getvalue().splitlines() == ['reading the bag for the summary']
@@ -463,7 +478,7 @@ def test_ctrl_c_ends_the_reading_of_the_bag_and_the_summary_is_written_all_the_s
     progress = Progress(SETTINGS, stream, live=False, clock=Clock())
     train._complete(late, tmp_path, progress, interrupts)
     assert 'stopped: the summary holds what was read until now' in stream.getvalue()
-    assert late.build({})['evaluations'] == []
+    assert late.build({}).evaluations == []
 
 
 def test_reward_recovery_without_all_true_rewards_is_said_not_to_be_told(tmp_path):
@@ -472,4 +487,4 @@ def test_reward_recovery_without_all_true_rewards_is_said_not_to_be_told(tmp_pat
     progress = Progress(SETTINGS, stream, live=False, clock=Clock())
     train._complete(late, tmp_path, progress, Interrupts())
     assert "cannot be told to the end: 'sim' told no true rewards" in stream.getvalue()
-    assert late.build({})['evaluations'], 'all else is told'
+    assert late.build({}).evaluations, 'all else is told'

@@ -10,7 +10,9 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
+
+from pydantic import Field
 
 from codetr_ros.bags.causal import causal, named, publisher
 from codetr_ros.bags.reader import Bag
@@ -29,6 +31,7 @@ from codetr_ros.records import (
     Transitions,
     TrueRewards,
 )
+from codetr_ros.runs.reports import CoreReport
 
 BATCH = 64
 """Messages that are given out at a time, at most."""
@@ -156,6 +159,12 @@ class Pace:
     def restart(self) -> None:
         """Go on from the next message: somebody had to be waited for."""
         self._first = None
+
+
+class PlaybackReport(CoreReport):
+    """What was played."""
+
+    phases: int = Field(description='phases of which all was played')
 
 
 class Playback:
@@ -292,6 +301,6 @@ class Playback:
     def close(self) -> None:
         """Nothing to save."""
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> PlaybackReport:
         """Counts for people."""
-        return {'counters': dict(self.counters), 'phases': self.phase + 1}
+        return PlaybackReport(counters=dict(self.counters), phases=self.phase + 1)

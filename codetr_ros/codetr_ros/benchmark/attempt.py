@@ -18,9 +18,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from codetr_ros.benchmark.folder import Folder, finished, provenance, read_json
+from codetr_ros.benchmark.folder import Folder, finished, provenance, read_json, read_summary
 from codetr_ros.processes import launcher
 from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs.run_summary import RunSummary
 from codetr_ros.system.files import atomic_write, sync_folder
 
 ERROR_LINES = 15
@@ -96,7 +97,7 @@ class Attempt:
             How it ended, as kept in `cells/<cell>.json`: `error` is None for a finished cell.
         """
         code, job, folder = self._process.wait(), self.job, self._folder
-        summary = read_json(self._place / run_folder.SUMMARY)
+        summary = read_summary(self._place)
         done = code == 0 and finished(summary, job.settings_hash)
         ending = {
             'cell': job.cell,
@@ -139,9 +140,9 @@ class Attempt:
         sync_folder(folder.path)
         return True
 
-    def _why(self, code: int, summary: dict[str, Any] | None) -> str:
-        if summary and summary.get('failure'):
-            return str(summary['failure'])
+    def _why(self, code: int, summary: RunSummary | None) -> str:
+        if summary and summary.failure:
+            return summary.failure
         if code < 0:
             try:
                 return f'ended by {signal.Signals(-code).name}'
@@ -153,7 +154,7 @@ class Attempt:
             return f'ended with exit code 0 but left no {run_folder.SUMMARY}'
         return (
             f'ended with exit code 0 but its {run_folder.SUMMARY} is of an unfinished run or of '
-            f'other settings (hash {summary.get("settings_hash")}, not {self.job.settings_hash})'
+            f'other settings (hash {summary.settings_hash}, not {self.job.settings_hash})'
         )
 
     def _remove(self) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from codetr_ros.benchmark.results import Result
 from codetr_ros.benchmark.table import methods
+from codetr_ros.runs.run_summary import Evaluation, RewardRecovery
 
 _COLOURS = (
     '#1f77b4',
@@ -25,6 +26,11 @@ _COLOURS = (
 _STYLES = ('-', '--', '-.', ':')
 _ANCHORS = {'random': ('random policy', '--'), 'zero': ('standing still', ':')}
 
+_ROWS: Mapping[str, Callable[[Result], Sequence[Evaluation | RewardRecovery]]] = {
+    'evaluations': lambda result: result.evaluations,
+    'reward_recovery': lambda result: result.reward_recovery,
+}
+
 Curve = tuple[list[int], list[float], list[float], list[float]]
 """Steps; mean, lowest and highest of the seeds at each."""
 
@@ -34,14 +40,15 @@ def curve(results: Sequence[Result], key: str, of: str) -> Curve:
 
     Args:
         results: cells that differ in their seed only.
-        key: of the summary: a list of rows with `step`.
+        key: of the summary: `evaluations` or `reward_recovery`.
         of: the number's name in a row.
     """
     at: dict[int, list[float]] = defaultdict(list)
     for result in results:
-        for row in result.summary.get(key) or ():
-            if row[of] is not None:
-                at[row['step']].append(row[of])
+        for row in _ROWS[key](result):
+            value: float | None = getattr(row, of)
+            if value is not None:
+                at[row.step].append(value)
     steps = sorted(at)
     means = [float(np.mean(at[step])) for step in steps]
     return steps, means, [min(at[step]) for step in steps], [max(at[step]) for step in steps]
@@ -73,7 +80,7 @@ def learning_curves(
 
 def recovery_curves(results: Sequence[Result], order: Sequence[str], title: str) -> bytes | None:
     """Correlation of labels and true rewards over training, as a PNG; None without any."""
-    if not any(result.summary.get('reward_recovery') for result in results):
+    if not any(result.reward_recovery for result in results):
         return None
     names = {
         'pearson': 'Pearson, all steps',

@@ -31,6 +31,8 @@ import yaml
 from codetr_ros.benchmark.spec import BenchmarkError, Cell, Spec
 from codetr_ros.config import flatten
 from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs import run_summary
+from codetr_ros.runs.run_summary import RunSummary
 from codetr_ros.system.files import atomic_write
 from codetr_ros.system.versions import versions
 
@@ -44,15 +46,19 @@ FORMAT = 1
 State = Literal['finished', 'failed', 'missing']
 
 
-def finished(summary: Mapping[str, Any] | None, settings_hash: str) -> bool:
+def finished(summary: RunSummary | None, settings_hash: str) -> bool:
     """Whether a run's summary says that all of it was done, under the settings of this hash."""
-    return bool(
-        summary
-        and summary.get('settings_hash') == settings_hash
-        and summary.get('steps') == summary.get('steps_planned')
-        and not summary.get('interrupted')
-        and not summary.get('failure')
-    )
+    return summary is not None and summary.settings_hash == settings_hash and summary.complete
+
+
+def read_summary(run: Path) -> RunSummary | None:
+    """The summary in the folder of a run; None where there is none, or none that can be read: its
+    cell is not finished.
+    """
+    try:
+        return run_summary.read(run / run_folder.SUMMARY)
+    except run_folder.RunFolderError:
+        return None
 
 
 def read_json(path: Path) -> dict[str, Any] | None:
@@ -95,9 +101,9 @@ class Folder:
         """Where runs work."""
         return self.path / ATTEMPTS
 
-    def summary(self, cell: str) -> dict[str, Any] | None:
+    def summary(self, cell: str) -> RunSummary | None:
         """The summary of the cell's run, if there is one."""
-        return read_json(self.run(cell) / run_folder.SUMMARY)
+        return read_summary(self.run(cell))
 
     def state(self, cell: str, settings_hash: str) -> State:
         """What has become of a cell whose settings have this hash."""

@@ -127,8 +127,8 @@ def cells_csv(results: Sequence[Result]) -> str:
                 'state': r.state,
                 'score': r.score,
                 'true_return': r.true_return,
-                'within_pearson': _last(r, 'within'),
-                'wall_s': r.summary.get('wall_s'),
+                'within_pearson': _last_within(r),
+                'wall_s': r.summary.wall_s if r.summary else None,
                 'commit': r.commit,
                 'error': r.error,
             }
@@ -137,9 +137,9 @@ def cells_csv(results: Sequence[Result]) -> str:
     )
 
 
-def _last(result: Result, of: str) -> float | None:
-    rows = result.summary.get('reward_recovery') or ()
-    return rows[-1][of] if rows else None
+def _last_within(result: Result) -> float | None:
+    rows = result.reward_recovery
+    return rows[-1].within if rows else None
 
 
 def _csv(lines: Sequence[dict[str, Any]]) -> str:

@@ -9,9 +9,10 @@ import yaml
 
 from codetr_ros.benchmark.folder import Folder, State, read_json
 from codetr_ros.benchmark.spec import BenchmarkError
+from codetr_ros.runs.run_summary import Evaluation, RewardRecovery, RunSummary
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Result:
     """A cell and what has become of it.
 
@@ -23,7 +24,7 @@ class Result:
         state: finished, failed or missing.
         error: why it is not finished; empty where it is.
         log: the end of what a failed cell printed.
-        summary: of a finished cell; else empty.
+        summary: of a finished cell.
         commit: what it was run with, where that is known.
     """
 
@@ -38,20 +39,28 @@ class Result:
     state: State
     error: str
     log: str
-    summary: Mapping[str, Any]
+    summary: RunSummary | None
     commit: str | None
 
     @property
     def score(self) -> float | None:
         """Mean score of the last evaluation's episodes."""
-        value = self.summary.get('final_score')
-        return None if value is None else float(value)
+        return self.summary.final_score if self.summary else None
 
     @property
     def true_return(self) -> float | None:
         """Mean true return of the last evaluation's episodes."""
-        value = self.summary.get('final_true_return')
-        return None if value is None else float(value)
+        return self.summary.final_true_return if self.summary else None
+
+    @property
+    def evaluations(self) -> Sequence[Evaluation]:
+        """Those of a finished cell, in the order of training steps."""
+        return self.summary.evaluations if self.summary else ()
+
+    @property
+    def reward_recovery(self) -> Sequence[RewardRecovery]:
+        """How well labels agreed with true rewards at each evaluation of a finished cell."""
+        return self.summary.reward_recovery if self.summary else ()
 
 
 def read(paths: Sequence[Path]) -> list[Result]:
@@ -85,19 +94,19 @@ def _read(folder: Folder) -> Iterator[Result]:
             raise BenchmarkError(f'{folder.settings(name)} cannot be read: {error}') from None
         failed = state == 'failed'
         yield Result(
-            name,
-            folder.path,
-            row['task'],
-            row['composite'],
-            row['delay'],
-            row['method'],
-            row['seed'],
-            settings,
-            state,
-            folder.error(name) if failed else '' if state == 'finished' else 'not run yet',
-            (ending.get('log') or '') if failed else '',
-            (folder.summary(name) or {}) if state == 'finished' else {},
-            ending.get('commit'),
+            cell=name,
+            folder=folder.path,
+            task=row['task'],
+            composite=row['composite'],
+            delay=row['delay'],
+            method=row['method'],
+            seed=row['seed'],
+            settings=settings,
+            state=state,
+            error=folder.error(name) if failed else '' if state == 'finished' else 'not run yet',
+            log=(ending.get('log') or '') if failed else '',
+            summary=folder.summary(name) if state == 'finished' else None,
+            commit=ending.get('commit'),
         )
 
 

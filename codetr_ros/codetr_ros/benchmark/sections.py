@@ -64,11 +64,11 @@ def recovery(results: Sequence[Result]) -> list[Block]:
         line: list[str | Bold] = [key[0], key[1], str(key[2])]
         for method in order:
             last = [
-                r.summary['reward_recovery'][-1]['within']
+                r.reward_recovery[-1].within
                 for r in results
                 if (r.task, r.composite, r.delay) == key
                 and r.method == method
-                and r.summary.get('reward_recovery')
+                and r.reward_recovery
             ]
             values = [value for value in last if value is not None]
             text = f'{np.mean(values):.2f}' if values else NONE

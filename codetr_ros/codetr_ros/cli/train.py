@@ -8,7 +8,7 @@ import time
 import traceback
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 from rich.console import Console
@@ -24,9 +24,12 @@ from codetr_ros.processes.supervise import Interrupts, Silence, supervise, why_i
 from codetr_ros.records import Commit, EpisodeResult, Metrics, Record, StepRewards, TrueRewards
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import report
+from codetr_ros.runs import reports as node_reports
 from codetr_ros.runs.folder import RunFolderError
 from codetr_ros.runs.progress import Progress
 from codetr_ros.runs.recovery import RecoveryError
+from codetr_ros.runs.reports import NodeReport
+from codetr_ros.runs.run_summary import RunSummary
 from codetr_ros.runs.summary import Summary
 from codetr_ros.runs.summary import write as write_summary
 from codetr_ros.system.files import atomic_write
@@ -42,7 +45,7 @@ ends all of it cleanly. Every setting is a flag; --config decides the defaults o
 class Outcome:
     """How a run ended."""
 
-    reports: Mapping[str, Mapping[str, Any]]
+    reports: Mapping[str, NodeReport]
     interrupted: bool = False
     failure: str | None = None
     log: Path | None = None  # where the failure is explained
@@ -172,12 +175,12 @@ def _in_process(
         return Outcome(in_process.run(settings, run_id, folder, observe, tick))
     except KeyboardInterrupt:
         progress.say('stopped')
-        return Outcome(run_folder.read_reports(folder), interrupted=True)
+        return Outcome(node_reports.read_all(folder), interrupted=True)
     except Exception as error:  # noqa: BLE001
         # Whatever it was: what was learnt until now is worth a summary, which names the failure.
         log = folder / run_folder.LOGS / 'in_process.log'
         atomic_write(log, traceback.format_exc())
-        reports = run_folder.read_reports(folder)
+        reports = node_reports.read_all(folder)
         return Outcome(reports, failure=f'{type(error).__name__}: {error}', log=log)
     finally:
         interrupts.raising = False
@@ -233,11 +236,11 @@ def _over_topics(
                 watcher.poll(0.0)  # the last words of the last node
         except LaunchError as error:
             failure = str(error)
-    reports = run_folder.read_reports(folder)
+    reports = node_reports.read_all(folder)
     for node in processes.nodes:
         key = run_folder.report_path(folder, node.role, node.name).stem
-        reports.setdefault(key, {'role': node.role, 'name': node.name})
-        reports[key]['exit_code'] = node.code
+        known = reports.get(key) or NodeReport(role=node.role, name=node.name)
+        reports[key] = known.model_copy(update={'exit_code': node.code})
     summary.end()
     interrupted = bool(interrupts.count)
     _complete(summary, folder, progress, interrupts)
@@ -280,16 +283,16 @@ def _short(path: Path) -> str:
         return str(path)
 
 
-def show(summary: Mapping[str, Any], folder: Path, console: Console) -> None:
+def show(summary: RunSummary, folder: Path, console: Console) -> None:
     """Print what came out of a run."""
-    if rows := summary['evaluations']:
-        first = [summary['random']['true_return_mean']] if summary['random'] else []
-        values = first + [row['true_return_mean'] for row in rows]
-        curve = report.sketch(values, console.encoding)
-        begins = 'random policy' if first else f'{rows[0]["step"]} steps'
+    values = [row.true_return_mean for row in summary.evaluated()]
+    known = [value for value in values if value is not None]
+    if summary.evaluations and len(known) == len(values):
+        curve = report.sketch(known, console.encoding)
+        begins = 'random policy' if summary.random else f'{summary.evaluations[0].step} steps'
         console.print(
-            f'\ntrue return, {begins} to {rows[-1]["step"]} steps: '
-            f'{values[0]:.1f} |{curve}| {values[-1]:.1f}',
+            f'\ntrue return, {begins} to {summary.evaluations[-1].step} steps: '
+            f'{known[0]:.1f} |{curve}| {known[-1]:.1f}',
             highlight=False,
             markup=False,
         )
@@ -305,11 +308,11 @@ def show(summary: Mapping[str, Any], folder: Path, console: Console) -> None:
         ('metrics', run_folder.METRICS),
     ):
         table.add_row(name, _short(folder / file))
-    if summary['bag']:
-        table.add_row('bag', _short(Path(summary['bag'])))
+    if summary.bag:
+        table.add_row('bag', _short(Path(summary.bag)))
     console.print()
     console.print(table)
-    if summary['interrupted']:
+    if summary.interrupted:
         console.print('\ninterrupted: what was done is kept', highlight=False)
 
 

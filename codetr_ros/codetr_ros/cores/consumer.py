@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 
@@ -14,6 +14,7 @@ from codetr_ros.cores.intake import Intake
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import Metrics, Record, RunSpec
 from codetr_ros.runs import checkpoints
+from codetr_ros.runs.reports import CoreReport, MemoryFacts
 
 
 class Consumer(ABC):
@@ -134,13 +135,14 @@ class Consumer(ABC):
         checkpoints.save(self._folder, self.role, done, self._state(), meta)
         self._saved = done
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> CoreReport:
         """Counts for the run's summary."""
-        said: dict[str, Any] = {
-            'duplicated': dict(self.duplicated),
-            'refused': dict(self.refused),
-            'counters': dict(self._counters),
-        }
-        if self._memory is not None:
-            said['memory'] = self._memory.report()
-        return said
+        report = CoreReport(
+            duplicated=dict(self.duplicated),
+            refused=dict(self.refused),
+            counters=dict(self._counters),
+        )
+        if self._memory is None:
+            return report
+        memory = MemoryFacts.model_validate(self._memory.report())
+        return report.model_copy(update={'memory': memory})

@@ -1,9 +1,10 @@
 """The shape of every part of a run, whoever wires it."""
 
 from collections.abc import Iterator
-from typing import Any, Protocol
+from typing import Protocol
 
 from codetr_ros.records import Record
+from codetr_ros.runs.reports import CoreReport
 
 
 class Core(Protocol):
@@ -27,5 +28,5 @@ class Core(Protocol):
     def close(self) -> None:
         """Save what must outlast the process; harmless when called again."""
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> CoreReport:
         """What to say in the run's summary."""

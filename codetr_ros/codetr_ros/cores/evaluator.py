@@ -2,11 +2,11 @@
 
 from collections import Counter, deque
 from collections.abc import Iterator
-from typing import Any
 
 from codetr_ros.config import Settings
 from codetr_ros.policy.acting import ActingPolicy, uniform_actions
 from codetr_ros.records import INITIAL_VERSION, EpisodeResult, Policy, Record, RunSpec
+from codetr_ros.runs.reports import CoreReport
 from codetr_ros.seeding import generator
 from codetr_ros.simulation.episode import Episode
 from codetr_ros.simulation.permission import acting_policy, check_policy
@@ -102,6 +102,6 @@ class Evaluator:
             self._closed = True
             self._environment.close()
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> CoreReport:
         """Counts for the run's summary."""
-        return {'lost': {}, 'duplicated': {}, 'counters': dict(self._counters)}
+        return CoreReport(lost={}, duplicated={}, counters=dict(self._counters))

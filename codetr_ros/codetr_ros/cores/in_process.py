@@ -7,12 +7,10 @@ takes; over topics no phase waits for it.
 """
 
 import logging
-import resource
 import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -25,6 +23,8 @@ from codetr_ros.cores.recorder import Recorder
 from codetr_ros.cores.simulator import Simulator
 from codetr_ros.records import TOPICS, Record
 from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs import reports as node_reports
+from codetr_ros.runs.reports import NodeReport
 
 _log = logging.getLogger(__name__)
 
@@ -35,7 +35,7 @@ def run(
     folder: Path | None = None,
     observe: Callable[[Record], None] = lambda record: None,
     tick: Callable[[], None] = lambda: None,
-) -> dict[str, dict[str, Any]]:
+) -> dict[str, NodeReport]:
     """Run Algorithm 1 to its end.
 
     Args:
@@ -98,21 +98,19 @@ def run(
         reports = {}
         for name, (role, core) in cores.items():
             core.close()
-            counts = {'published': dict(published[name]), 'received': dict(received[name])}
-            reports[name] = _report(role, name, core, seconds[name]) | counts
+            reports[name] = node_reports.node_report(
+                core.report(),
+                role=role,
+                name=name,
+                published=published[name],
+                received=received[name],
+                refused={},
+                cpu_s=seconds[name],
+                wall_s=seconds[name],
+                finished=core.finished,
+                error=None,
+            )
             if folder is not None:
-                run_folder.write_report(folder, role, name, reports[name])
+                path = run_folder.report_path(folder, role, name)
+                node_reports.write(path, reports[name])
     return reports
-
-
-def _report(role: str, name: str, core: Core, seconds: float) -> dict[str, Any]:
-    return {
-        'role': role,
-        'name': name,
-        'refused': {},
-        'peak_rss_mb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        'cpu_s': seconds,
-        'wall_s': seconds,
-        'finished': core.finished,
-        'error': None,
-    } | core.report()

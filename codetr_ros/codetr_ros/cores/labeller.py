@@ -4,7 +4,6 @@ import time
 from collections import Counter
 from collections.abc import Generator, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -30,6 +29,7 @@ from codetr_ros.records import (
 from codetr_ros.rewards import registry, saved
 from codetr_ros.rewards.base import RewardMethod, RewardModelError
 from codetr_ros.runs import checkpoints
+from codetr_ros.runs.reports import CoreReport, StartedFrom
 from codetr_ros.seeding import generator, seed_torch
 
 
@@ -262,19 +262,19 @@ class Labeller(Consumer):
         assert self._method is not None
         return self._method.state()
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> CoreReport:
         """Counts and the digest of the reward model, for the run's summary."""
-        said = super().report()
+        more: dict[str, int | str | StartedFrom] = {}
         if self._method is not None:
-            said['gradient_steps'] = self._method.gradient_steps
-            said['reward_model_sha256'] = checkpoints.digest(self._method.state())
+            more['gradient_steps'] = self._method.gradient_steps
+            more['reward_model_sha256'] = checkpoints.digest(self._method.state())
         if self._start is not None:
-            said['started_from'] = {
-                'checkpoint': str(self._start.path),
-                'reward_model_sha256': self._start.digest,
-                'frozen': self._frozen,
-            }
-        return said
+            more['started_from'] = StartedFrom(
+                checkpoint=str(self._start.path),
+                reward_model_sha256=self._start.digest,
+                frozen=self._frozen,
+            )
+        return super().report().model_copy(update=more)
 
 
 def _joined(

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -29,6 +28,7 @@ from codetr_ros.records import (
 )
 from codetr_ros.records.checks import check_run
 from codetr_ros.runs import checkpoints
+from codetr_ros.runs.reports import CoreReport
 from codetr_ros.system.devices import usable
 
 
@@ -147,13 +147,15 @@ class Learner(Consumer):
             state[f'labels/{source}'] = torch.from_numpy(labels)
         return state
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> CoreReport:
         """Counts and the digest of the policy, for the run's summary."""
-        said = super().report()
+        report = super().report()
         if self._learner is None:
-            return said | {'updates': 0}
-        return said | {
-            'updates': self._learner.updates,
-            'counters': said['counters'] | self._learner.counters,
-            'policy_sha256': checkpoints.digest(self._learner.actor.state_dict()),
-        }
+            return report.model_copy(update={'updates': 0})
+        return report.model_copy(
+            update={
+                'updates': self._learner.updates,
+                'counters': report.counters | self._learner.counters,
+                'policy_sha256': checkpoints.digest(self._learner.actor.state_dict()),
+            }
+        )

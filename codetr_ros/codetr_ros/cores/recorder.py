@@ -27,6 +27,7 @@ from codetr_ros.records import (
     metrics,
 )
 from codetr_ros.records.checks import check_run, check_score
+from codetr_ros.runs.reports import CoreReport
 
 
 class Recorder:
@@ -175,10 +176,10 @@ class Recorder:
     def close(self) -> None:
         """Nothing to save: the bag belongs to whoever wires this core."""
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> CoreReport:
         """Counts for the run's summary."""
-        return {
-            'duplicated': dict(self.duplicated),
-            'refused': dict(self.refused),
-            'counters': {'phases_committed': self.phase},
-        }
+        return CoreReport(
+            duplicated=dict(self.duplicated),
+            refused=dict(self.refused),
+            counters={'phases_committed': self.phase},
+        )

@@ -3,7 +3,6 @@
 import time
 from collections import Counter
 from collections.abc import Iterator
-from typing import Any
 
 from codetr_ros.config import Settings
 from codetr_ros.policy.acting import ActingPolicy
@@ -17,6 +16,7 @@ from codetr_ros.records import (
     describe,
     metrics,
 )
+from codetr_ros.runs.reports import CoreReport
 from codetr_ros.simulation.permission import acting_policy, check_policy
 from codetr_ros.simulation.source import Source
 
@@ -135,12 +135,12 @@ class Simulator:
             for source in self._sources:
                 source.close()
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> CoreReport:
         """Counts for the run's summary."""
         counters = self._counters.copy()
         for source in self._sources:
             counters.update(source.counters)
-        return {'lost': {}, 'duplicated': {}, 'counters': dict(counters)}
+        return CoreReport(lost={}, duplicated={}, counters=dict(counters))
 
 
 def _transitions(records: list[Record]) -> Transitions:

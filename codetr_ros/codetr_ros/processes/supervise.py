@@ -10,6 +10,7 @@ from typing import Any
 from codetr_ros.processes.launcher import Node, Processes
 from codetr_ros.records import Presence, Record
 from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs import reports
 
 SILENCE_DEADLINE = 90.0
 """Seconds of silence that the last nodes may take to end after the others."""
@@ -143,8 +144,8 @@ def why_it_gave_up(node: Node, folder: Path) -> str | None:
     path = run_folder.report_path(folder, node.role, node.name)
     if not path.is_file():
         return f'{node.name} ended without a report'
-    report = run_folder.read_report(path)
-    if report.get('finished') is False:
-        error = report.get('error')
-        return f'{node.name} ended before the run had finished' + (f': {error}' if error else '')
+    report = reports.read(path)
+    if report.finished is False:
+        why = f': {report.error}' if report.error else ''
+        return f'{node.name} ended before the run had finished{why}'
     return None

@@ -16,7 +16,6 @@ import os
 import resource
 import time
 import traceback
-from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -31,6 +30,8 @@ from codetr_ros.ros.member import MakeCore
 from codetr_ros.ros.patience import Patience
 from codetr_ros.ros.signals import Stop
 from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs import reports
+from codetr_ros.runs.reports import BagReport, CoreReport
 
 ACK_DEADLINE = 5.0  # [s] at the end for readers that have not everything yet
 STOPPED_DEADLINE = 0.1  # [s] the same when the process was asked to stop
@@ -111,9 +112,9 @@ class CoreNode(Joining):
     def closing(self) -> None:
         """Finish what the node itself holds open, once nothing more will arrive."""
 
-    def own_report(self) -> dict[str, Any]:
+    def own_report(self) -> BagReport | None:
         """What the node adds to the core's report."""
-        return {}
+        return None
 
     def _end(self, error: str | None) -> int:
         """Save, report, say goodbye; returns the exit code."""
@@ -149,29 +150,22 @@ class CoreNode(Joining):
         if self.folder is None:
             return
         used = resource.getrusage(resource.RUSAGE_SELF)
-        report: dict[str, Any] = {
-            'role': self.role,
-            'name': self.link.name,
-            'published': {t: n for t, n in self.link.published.items() if t != 'presence'},
-            'received': dict(self.received),
-            'refused': dict(self.refused),
-            'lost': self.lost(),
-            'fetched': dict(self.recovered),
-            'peak_rss_mb': used.ru_maxrss / 1024,
-            'cpu_s': used.ru_utime + used.ru_stime,
-            'wall_s': time.monotonic() - self._started,
-            'finished': finished,
-            'error': error,
-        }
-        for said in (self.core.report() if self.core else {}, self.own_report()):
-            for key, value in said.items():
-                both = (
-                    isinstance(value, dict)
-                    and isinstance(report.get(key), dict)
-                    and key != 'counters'
-                )
-                report[key] = dict(Counter(report[key]) + Counter(value)) if both else value
-        run_folder.write_report(self.folder, self.role, self.link.name, report)
+        report = reports.node_report(
+            self.core.report() if self.core else CoreReport(),
+            role=self.role,
+            name=self.link.name,
+            published={t: n for t, n in self.link.published.items() if t != 'presence'},
+            received=self.received,
+            refused=self.refused,
+            lost=self.lost(),
+            fetched=self.recovered,
+            cpu_s=used.ru_utime + used.ru_stime,
+            wall_s=time.monotonic() - self._started,
+            finished=finished,
+            error=error,
+            own=self.own_report(),
+        )
+        reports.write(run_folder.report_path(self.folder, self.role, self.link.name), report)
 
     def _goodbye(self) -> None:
         """Say the last word, and stay until the readers have everything or have finished too.

@@ -1,7 +1,6 @@
 """Roles of a recorded run that are there because live nodes wait for them."""
 
 from collections.abc import Callable, Collection, Iterator
-from typing import Any
 
 from rclpy.logging import LoggingSeverity
 
@@ -12,6 +11,7 @@ from codetr_ros.ros.joining import Joining
 from codetr_ros.ros.link import RECORDS_OF_TOPIC
 from codetr_ros.ros.peers import WRITERS, readers
 from codetr_ros.ros.signals import Stop
+from codetr_ros.runs.reports import CoreReport
 
 
 class _Silent:
@@ -31,9 +31,9 @@ class _Silent:
     def close(self) -> None:
         """Nothing to save."""
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> CoreReport:
         """Nothing to report."""
-        return {}
+        return CoreReport()
 
 
 def _must_read(role: str, settings: Settings, live: Collection[str]) -> list[type]:

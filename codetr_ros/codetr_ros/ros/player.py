@@ -237,9 +237,9 @@ class PlayNode(Played, CoreNode):
         """Print the counts."""
         if not isinstance(self.core, Playback):
             return
-        said = self.core.report()
-        counts = ', '.join(f'{n} {what}' for what, n in sorted(said['counters'].items()))
-        print(f'played {said["phases"]} of {self._recorded.phases} phases: {counts}')
+        report = self.core.report()
+        counts = ', '.join(f'{n} {what}' for what, n in sorted(report.counters.items()))
+        print(f'played {report.phases} of {self._recorded.phases} phases: {counts}')
         print(
             'published: ' + ', '.join(f'{n} {topic}' for topic, n in sorted(self.played.items()))
         )

@@ -28,6 +28,7 @@ from codetr_ros.ros.peers import published_by
 from codetr_ros.ros.resend import Resender
 from codetr_ros.ros.signals import Stop
 from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs.reports import BagReport, FlushTimes
 
 NOT_RECORDED = (Presence,)
 """Says who is alive, once a second: nothing of the run itself."""
@@ -186,13 +187,13 @@ class RecordNode(CoreNode):
         if self._bag is not None:
             self._bag.close()
 
-    def own_report(self) -> dict[str, Any]:
+    def own_report(self) -> BagReport:
         """What was recorded, and where."""
         median = 1e3 * sorted(self._flushes)[len(self._flushes) // 2] if self._flushes else 0.0
-        return {
-            'recorded': dict(self._recorded),
-            'bag': str(self._bag.folder) if self._bag else None,
-            'bag_bytes': self._bag.size if self._bag else 0,
-            'flush_seconds': self._flush_seconds,
-            'flush_ms': {'median': median, 'max': 1e3 * self._longest_flush},
-        }
+        return BagReport(
+            recorded=dict(self._recorded),
+            bag=str(self._bag.folder) if self._bag else None,
+            bag_bytes=self._bag.size if self._bag else 0,
+            flush_seconds=self._flush_seconds,
+            flush_ms=FlushTimes(median=median, max=1e3 * self._longest_flush),
+        )

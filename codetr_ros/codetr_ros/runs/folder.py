@@ -1,10 +1,8 @@
 """The folder of a run: what lies where in it."""
 
-import json
 import os
 import re
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -12,29 +10,13 @@ from codetr_ros import config
 from codetr_ros.system.files import atomic_write
 
 CONFIG = 'config.yaml'
-
-
 BAG = 'bag'
-
-
 CHECKPOINTS = 'checkpoints'
-
-
 NODES = 'nodes'
-
-
 LOGS = 'logs'
-
-
 SUMMARY = 'summary.json'
-
-
 METRICS = 'metrics.csv'
-
-
 REPORT = 'report.html'
-
-
 PICTURE = 'learning_curve.png'
 
 
@@ -132,42 +114,3 @@ def _file_name(text: str) -> str:
 def report_path(folder: Path, role: str, name: str) -> Path:
     """Where the node of this role and (fully qualified or plain) name leaves its report."""
     return folder / NODES / f'{role}-{_file_name(name.rsplit("/", 1)[-1])}.json'
-
-
-def write_report(folder: Path, role: str, name: str, report: dict[str, Any]) -> Path:
-    """Write what a node did to `nodes/<role>-<name>.json`.
-
-    Args:
-        folder: the run's folder.
-        role: one of `records.ROLES`.
-        name: node name; of a fully qualified one the last part becomes the file's name.
-        report: JSON-able; `role` and `name` are added where missing.
-    """
-    path = report_path(folder, role, name)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    atomic_write(path, json.dumps({'role': role, 'name': name} | report, indent=2) + '\n')
-    return path
-
-
-def read_report(path: Path) -> dict[str, Any]:
-    """One node's report.
-
-    Raises:
-        RunFolderError: it is not a JSON object.
-    """
-    try:
-        report = json.loads(path.read_text())
-    except ValueError as error:
-        raise RunFolderError(f'node report {path} is not JSON ({error})') from None
-    if not isinstance(report, dict):
-        raise RunFolderError(f'node report {path} holds {type(report).__name__}, not an object')
-    return report
-
-
-def read_reports(folder: Path) -> dict[str, dict[str, Any]]:
-    """All node reports that are there, by `<role>-<name>`.
-
-    Raises:
-        RunFolderError: one of them is damaged.
-    """
-    return {path.stem: read_report(path) for path in sorted((folder / NODES).glob('*.json'))}

@@ -1,26 +1,28 @@
 """The report of a run for people: a picture of the learning curve and one HTML page."""
 
 import io
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from codetr_ros.config import flatten
 from codetr_ros.runs import document
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.document import Block, Heading, Paragraph, Picture, facts, records
+from codetr_ros.runs.run_summary import RunSummary
 from codetr_ros.system.files import atomic_write
 
 _TRUE, _SCORE = '#1f5fa8', '#b8561c'
 
 
-def title(summary: Mapping[str, Any]) -> str:
+def title(summary: RunSummary) -> str:
     """What run it was, in a line."""
-    said = '{task}, {composite} of {delay} steps, {method}, seed {seed}'.format(**summary)
-    return said + (' (interrupted)' if summary['interrupted'] else '')
+    s = summary
+    what = f'{s.task}, {s.composite} of {s.delay} steps, {s.method}, seed {s.seed}'
+    return what + (' (interrupted)' if s.interrupted else '')
 
 
-def draw(summary: Mapping[str, Any]) -> bytes:
+def draw(summary: RunSummary) -> bytes:
     """The learning curve as a PNG: true return and score of each evaluation against steps.
 
     The bands show the spread over an evaluation's episodes: from the worst to the best for the
@@ -30,7 +32,7 @@ def draw(summary: Mapping[str, Any]) -> bytes:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    rows, random = summary['evaluations'], summary['random']
+    rows, random = summary.evaluations, summary.random
     figure = Figure(figsize=(8, 6), dpi=120, layout='constrained')
     FigureCanvasAgg(figure)
     figure.suptitle(title(summary), fontsize=11)
@@ -38,10 +40,11 @@ def draw(summary: Mapping[str, Any]) -> bytes:
     upper.set_ylabel('true return of an episode')
     lower.set_ylabel('score\n(composite return / perfect)')
     lower.set_xlabel('environment steps')
-    lower.set_xlim(0, summary['steps_planned'])
+    lower.set_xlim(0, summary.steps_planned)
 
     def column(name: str) -> list[float]:
-        return [row[name] for row in rows]
+        values = [getattr(row, name) for row in rows]
+        return [math.nan if value is None else value for value in values]
 
     score, std = column('score_mean'), column('score_std')
     for axes, colour, mean, low, high, name in (
@@ -71,7 +74,7 @@ def draw(summary: Mapping[str, Any]) -> bytes:
         else:
             axes.text(0.5, 0.5, 'no evaluation', transform=axes.transAxes, ha='center')
         if random:
-            axes.axhline(random[name], color='#555', ls='--', lw=1, label='random policy')
+            axes.axhline(getattr(random, name), color='#555', ls='--', lw=1, label='random policy')
         if rows or random:
             axes.legend(loc='best', fontsize=8, framealpha=0.8)
     picture = io.BytesIO()
@@ -79,18 +82,18 @@ def draw(summary: Mapping[str, Any]) -> bytes:
     return picture.getvalue()
 
 
-def page(summary: Mapping[str, Any], picture: bytes) -> str:
+def page(summary: RunSummary, picture: bytes) -> str:
     """The HTML page, with everything in it."""
     identity = {
-        name: summary[name]
+        name: getattr(summary, name)
         for name in ('run_id', 'policy_sha256', 'reward_model_sha256', 'settings_hash')
     }
-    versions = {f'version of {name}': value for name, value in summary['versions'].items()}
-    processes = [{'process': name, **row} for name, row in summary['processes'].items()]
-    messages = [{'topic': topic, **row} for topic, row in summary['messages'].items()]
+    versions = {f'version of {name}': value for name, value in summary.versions.items()}
+    processes = [{'process': n, **row.model_dump()} for n, row in summary.processes.items()]
+    messages = [{'topic': topic, **row.model_dump()} for topic, row in summary.messages.items()]
     blocks: list[Block] = [
         Heading(title(summary), 1),
-        *([Paragraph(summary['failure'], bad=True)] if summary['failure'] else []),
+        *([Paragraph(summary.failure, bad=True)] if summary.failure else []),
         Picture(picture, 'learning curve'),
         Heading('Result'),
         facts(result_rows(summary)),
@@ -99,59 +102,56 @@ def page(summary: Mapping[str, Any], picture: bytes) -> str:
             "task's largest reward at every step."
         ),
         Heading('Evaluations'),
-        records(([summary['random']] if summary['random'] else []) + summary['evaluations']),
+        records([row.model_dump() for row in summary.evaluated()]),
         Heading('Messages'),
         records(messages),
         Heading('Processes'),
         records(processes),
         Heading('Settings'),
-        facts(list(flatten(summary['settings']))),
+        facts(list(flatten(summary.settings))),
         Heading('Identity'),
         facts(identity | versions),
     ]
     return document.page(blocks)
 
 
-def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+def result_rows(summary: RunSummary) -> list[tuple[str, str]]:
     """The few numbers that people look for first, for the page and for the terminal."""
 
     def number(value: float | None, form: str) -> str:
         return 'not evaluated' if value is None else format(value, form)
 
-    last = summary['evaluations'][-1] if summary['evaluations'] else None
-    spread = f' +- {last["true_return_std"]:.1f}' if last else ''
-    after = f' after {last["step"]} steps' if last else ''
+    last = summary.evaluations[-1] if summary.evaluations else None
+    spread = f' +- {last.true_return_std:.1f}' if last and last.true_return_std is not None else ''
+    after = f' after {last.step} steps' if last else ''
     return [
-        ('score', f'{number(summary["final_score"], ".3f")}{after}'),
-        ('score of the random policy', number(summary['random_score'], '.3f')),
-        ('true return', f'{number(summary["final_true_return"], ".1f")}{spread}'),
-        ('true return of the random policy', number(summary['random_true_return'], '.1f')),
+        ('score', f'{number(summary.final_score, ".3f")}{after}'),
+        ('score of the random policy', number(summary.random_score, '.3f')),
+        ('true return', f'{number(summary.final_true_return, ".1f")}{spread}'),
+        ('true return of the random policy', number(summary.random_true_return, '.1f')),
         ('reward recovery', _recovery(summary)),
-        ('steps', f'{summary["steps"]} of {summary["steps_planned"]}'),
-        ('phases', f'{summary["phases"]} of {summary["phases_planned"]}'),
-        ('time', f'{summary["wall_s"]:.1f} s, {summary["steps_per_s"] or 0:.0f} steps per second'),
+        ('steps', f'{summary.steps} of {summary.steps_planned}'),
+        ('phases', f'{summary.phases} of {summary.phases_planned}'),
+        ('time', f'{summary.wall_s:.1f} s, {summary.steps_per_s or 0:.0f} steps per second'),
         (
             'messages',
-            f'{sum(row["published"] for row in summary["messages"].values())} published, '
-            + ', '.join(
-                f'{summary[fault]} {fault}' for fault in ('lost', 'duplicated', 'refused')
-            ),
+            f'{sum(row.published for row in summary.messages.values())} published, '
+            f'{summary.lost} lost, {summary.duplicated} duplicated, {summary.refused} refused',
         ),
     ]
 
 
-def _recovery(summary: Mapping[str, Any]) -> str:
+def _recovery(summary: RunSummary) -> str:
     """How well step rewards agreed with the true ones when they were last compared."""
-    rows, evaluations = summary['reward_recovery'], summary['evaluations']
+    rows, evaluations = summary.reward_recovery, summary.evaluations
     if not rows:
         return 'no labels were compared'
-    said = {'pearson': 'correlation', 'within': 'within segments'}
-    found = [
-        f'{name} {rows[-1][key]:.2f}' for key, name in said.items() if rows[-1][key] is not None
-    ]
-    late = bool(evaluations) and evaluations[-1]['step'] != rows[-1]['step']
-    after = f', after {rows[-1]["step"]} steps' if late else ''
-    return (', '.join(found) or 'not defined where one side does not vary') + after
+    last = rows[-1]
+    values = {'correlation': last.pearson, 'within segments': last.within}
+    shown = [f'{name} {value:.2f}' for name, value in values.items() if value is not None]
+    late = bool(evaluations) and evaluations[-1].step != last.step
+    after = f', after {last.step} steps' if late else ''
+    return (', '.join(shown) or 'not defined where one side does not vary') + after
 
 
 _BARS = ' ▁▂▃▄▅▆▇█'
@@ -171,7 +171,7 @@ def sketch(values: Sequence[float], encoding: str | None) -> str:
     return ''.join(bars[1 + round((v - low) / (high - low) * (top - 1))] for v in values)
 
 
-def write(folder: Path, summary: Mapping[str, Any]) -> None:
+def write(folder: Path, summary: RunSummary) -> None:
     """Write the picture and the page into a run's folder."""
     picture = draw(summary)
     atomic_write(folder / run_folder.PICTURE, picture)

@@ -1,36 +1,39 @@
-"""What is said about a run when it is over: `summary.json` and `metrics.csv`.
+"""What a run leaves when it is over: `summary.json` and `metrics.csv`.
 
 Both are made from the run's records and from the reports that its nodes leave.
 """
 
 import csv
 import io
-import json
-import math
 import resource
 import time
-from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
+from pydantic import JsonValue
 
 from codetr_ros.config import Settings
 from codetr_ros.records import TOPICS, Commit, EpisodeResult, Metrics, Record
 from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs import run_summary
 from codetr_ros.runs.recovery import Recovery
+from codetr_ros.runs.reports import NodeReport
+from codetr_ros.runs.run_summary import (
+    Evaluation,
+    MessageCounts,
+    ProcessUse,
+    RewardRecovery,
+    RunSummary,
+)
 from codetr_ros.system.files import atomic_write
 from codetr_ros.system.versions import versions
 
-Report = Mapping[str, Any]
-
-
-_COUNTS = ('published', 'recorded', 'received_by_learner', 'received_by_reward')
-
-
-_FAULTS = ('lost', 'duplicated', 'refused')
+_T = TypeVar('_T')
 
 
 @dataclass
@@ -48,13 +51,12 @@ class _Results:
         """In an order that does not depend on who was heard first."""
         return [result for _, result in sorted(self.told.items())]
 
-    def row(self, step: int) -> dict[str, Any]:
+    def numbers(self) -> dict[str, float]:
+        """Means and spread; not a number where an episode's are not."""
         episodes = self.episodes
         true = np.array([e.true_return for e in episodes])
         score = np.array([e.score for e in episodes])
         return {
-            'step': step,
-            'version': self.version,
             'true_return_mean': float(true.mean()),
             'true_return_std': float(true.std()),
             'true_return_min': float(true.min()),
@@ -63,8 +65,17 @@ class _Results:
             'score_mean': float(score.mean()),
             'score_std': float(score.std()),
             'length_mean': float(np.mean([e.length for e in episodes])),
-            'episodes': len(episodes),
         }
+
+    def row(self, step: int) -> Evaluation:
+        return Evaluation.model_validate(
+            {
+                'step': step,
+                'version': self.version,
+                **self.numbers(),
+                'episodes': len(self.told),
+            }
+        )
 
 
 class Summary:
@@ -142,76 +153,77 @@ class Summary:
         """The run is over: what is learnt about it from now on takes none of its time."""
         self._wall = self.wall_s
 
-    def evaluations(self) -> list[dict[str, Any]]:
+    def evaluations(self) -> list[Evaluation]:
         """One row for each evaluation, in order of training steps."""
         return [results.row(step) for step, results in sorted(self._evaluations.items())]
 
-    def random(self) -> dict[str, Any] | None:
+    def random(self) -> Evaluation | None:
         """How the uniformly random policy did, or None where it was not evaluated."""
         return self._random.row(0) if self._random else None
 
     def build(
         self,
-        reports: Mapping[str, Report],
+        reports: Mapping[str, NodeReport],
         bag: Path | None = None,
         interrupted: bool = False,
         failure: str | None = None,
-    ) -> dict[str, Any]:
-        """The content of `summary.json`.
+    ) -> RunSummary:
+        """The content of `summary.json`; what is not known is None.
 
         Args:
             reports: what the nodes said at their end, by `<role>-<name>`.
             bag: the folder with the run's bag, if there is one.
             interrupted: somebody ended the run before it had finished.
             failure: why the run failed, if it did.
-
-        Returns:
-            A JSON-able dict. What is not known is None; numbers are finite.
         """
         settings, wall = self.settings, self.wall_s
         evaluations, random = self.evaluations(), self.random()
         last = evaluations[-1] if evaluations else None
         messages = count_messages(reports)
-        said = {
-            'run_id': self.run_id,
-            'task': settings.task,
-            'composite': settings.composite,
-            'delay': settings.delay,
-            'method': settings.method,
-            'seed': settings.seed,
-            'overlap': settings.overlap,
-            'in_process': self.in_process,
-            'interrupted': interrupted,
-            'failure': failure,
-            'steps': self.steps,
-            'steps_planned': settings.steps,
-            'phases': self.phases,
-            'phases_planned': settings.phases,
-            'wall_s': round(wall, 3),
-            'steps_per_s': round(self.steps / wall, 3) if wall > 0 else None,
-            'evaluations': evaluations,
-            'random': random,
-            'reward_recovery': self._recovery.rows,
-            'random_score': random['score_mean'] if random else None,
-            'final_score': last['score_mean'] if last else None,
-            'random_true_return': random['true_return_mean'] if random else None,
-            'final_true_return': last['true_return_mean'] if last else None,
-            'policy_sha256': _from_role(reports, 'learner', 'policy_sha256'),
-            'reward_model_sha256': _from_role(reports, 'reward', 'reward_model_sha256'),
-            'updates': _from_role(reports, 'learner', 'updates'),
-            'gradient_steps': _from_role(reports, 'reward', 'gradient_steps'),
-            'messages': messages,
-            **{fault: sum(row[fault] for row in messages.values()) for fault in _FAULTS},
-            'bag': _from_role(reports, 'record', 'bag') or (str(bag) if bag else None),
-            'processes': processes(reports),
-            'counters': {
-                n: r['counters'] for n, r in sorted(reports.items()) if r.get('counters')
-            },
-            'versions': versions(),
-            'settings_hash': settings.hash(),
-            'settings': settings.model_dump(mode='json'),
-        }
-        return {key: finite(value) for key, value in said.items()}
+
+        def of_role(role: str) -> list[NodeReport]:
+            return [report for report in reports.values() if report.role == role]
+
+        settings_json: dict[str, JsonValue] = settings.model_dump(mode='json')
+        return RunSummary(
+            run_id=self.run_id,
+            task=settings.task,
+            composite=settings.composite,
+            delay=settings.delay,
+            method=settings.method,
+            seed=settings.seed,
+            overlap=settings.overlap,
+            in_process=self.in_process,
+            interrupted=interrupted,
+            failure=failure,
+            steps=self.steps,
+            steps_planned=settings.steps,
+            phases=self.phases,
+            phases_planned=settings.phases,
+            wall_s=round(wall, 3),
+            steps_per_s=round(self.steps / wall, 3) if wall > 0 else None,
+            evaluations=evaluations,
+            random=random,
+            reward_recovery=[RewardRecovery.model_validate(row) for row in self._recovery.rows],
+            random_score=random.score_mean if random else None,
+            final_score=last.score_mean if last else None,
+            random_true_return=random.true_return_mean if random else None,
+            final_true_return=last.true_return_mean if last else None,
+            policy_sha256=_first(r.policy_sha256 for r in of_role('learner')),
+            reward_model_sha256=_first(r.reward_model_sha256 for r in of_role('reward')),
+            updates=_first(r.updates for r in of_role('learner')),
+            gradient_steps=_first(r.gradient_steps for r in of_role('reward')),
+            messages=messages,
+            lost=sum(row.lost for row in messages.values()),
+            duplicated=sum(row.duplicated for row in messages.values()),
+            refused=sum(row.refused for row in messages.values()),
+            bag=_first(r.bag for r in of_role('record')) or (str(bag) if bag else None),
+            processes=processes(reports),
+            counters={n: r.counters for n, r in sorted(reports.items()) if r.counters},
+            versions=versions(),
+            settings_hash=settings.hash(),
+            settings=settings_json,
+        )
 
     def metrics_csv(self) -> str:
         """The content of `metrics.csv`: a row for each phase, a column for each number.
@@ -238,13 +250,12 @@ class Summary:
                 'training.length_mean': float(np.mean([e.length for e in episodes])),
                 'training.episodes': len(episodes),
             }
-        evaluated = [(r.version, r.row(step)) for step, r in self._evaluations.items()]
+        evaluated = [(results.version, results) for results in self._evaluations.values()]
         if self._random:
-            evaluated.append((-1, self._random.row(0)))
-        for version, row in evaluated:
-            rows[version] |= {
-                f'evaluation.{n}': v for n, v in row.items() if n not in ('step', 'version')
-            }
+            evaluated.append((-1, self._random))
+        for version, results in evaluated:
+            rows[version] |= {f'evaluation.{n}': v for n, v in results.numbers().items()}
+            rows[version]['evaluation.episodes'] = len(results.told)
         columns = sorted({column for row in rows.values() for column in row})
         text = io.StringIO()
         writer = csv.writer(text, lineterminator='\n')
@@ -257,67 +268,60 @@ class Summary:
         return text.getvalue()
 
 
-def count_messages(reports: Mapping[str, Report]) -> dict[str, dict[str, int]]:
-    """How many messages each topic carried, and what became of them.
-
-    Returns:
-        For each topic: published (by all nodes), recorded (in the bag), received by the learner
-            and by the reward
-        node, and what any node counted as lost, duplicated or refused.
+def count_messages(reports: Mapping[str, NodeReport]) -> dict[str, MessageCounts]:
+    """How many messages each topic carried, and what became of them; topics that carried none are
+    there too.
     """
-    table = {topic: dict.fromkeys((*_COUNTS, *_FAULTS), 0) for topic in TOPICS.values()}
-
-    def add(report: Report, key: str, column: str) -> None:
-        for topic, count in (report.get(key) or {}).items():
-            row = table.setdefault(topic, dict.fromkeys((*_COUNTS, *_FAULTS), 0))
-            row[column] += int(count)
-
+    columns: dict[str, Counter[str]] = {name: Counter() for name in MessageCounts.model_fields}
     for report in reports.values():
-        add(report, 'published', 'published')
-        if report.get('role') in ('learner', 'reward'):
-            add(report, 'received', f'received_by_{report["role"]}')
-        if report.get('role') == 'record':
-            add(report, 'recorded', 'recorded')
-        for fault in _FAULTS:
-            add(report, fault, fault)
-    return table
+        columns['published'].update(report.published)
+        if report.role in ('learner', 'reward'):
+            columns[f'received_by_{report.role}'].update(report.received)
+        if report.role == 'record':
+            columns['recorded'].update(report.recorded)
+        columns['lost'].update(report.lost)
+        columns['duplicated'].update(report.duplicated)
+        columns['refused'].update(report.refused)
+    topics = dict.fromkeys([*TOPICS.values(), *chain.from_iterable(columns.values())])
+    return {
+        topic: MessageCounts.model_validate({n: column[topic] for n, column in columns.items()})
+        for topic in topics
+    }
 
 
-def processes(reports: Mapping[str, Report]) -> dict[str, dict[str, Any]]:
-    """What each process took, this one too: memory at its peak [MB] and processor time [s]."""
-    keys = ('role', 'peak_rss_mb', 'cpu_s', 'wall_s', 'finished', 'error', 'exit_code')
-    found = {
-        name: {key: report.get(key) for key in keys} for name, report in sorted(reports.items())
+def processes(reports: Mapping[str, NodeReport]) -> dict[str, ProcessUse]:
+    """What each process took, and this one too."""
+    used = {
+        name: ProcessUse(
+            role=report.role,
+            peak_rss_mb=report.peak_rss_mb,
+            cpu_s=report.cpu_s,
+            wall_s=report.wall_s,
+            finished=report.finished,
+            error=report.error,
+            exit_code=report.exit_code,
+        )
+        for name, report in sorted(reports.items())
     }
     own = resource.getrusage(resource.RUSAGE_SELF)
-    found['codetr'] = {
-        'role': 'codetr',
-        'peak_rss_mb': own.ru_maxrss / 1024,
-        'cpu_s': own.ru_utime + own.ru_stime,
-        'wall_s': None,
-        'finished': None,
-        'error': None,
-        'exit_code': None,
-    }
-    return found
+    used['codetr'] = ProcessUse(
+        role='codetr',
+        peak_rss_mb=own.ru_maxrss / 1024,
+        cpu_s=own.ru_utime + own.ru_stime,
+        wall_s=None,
+        finished=None,
+        error=None,
+        exit_code=None,
+    )
+    return used
 
 
-def finite(value: Any) -> Any:
-    """The same value with None for each number that JSON cannot hold (NaN, infinities)."""
-    if isinstance(value, Mapping):
-        return {str(key): finite(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def write(folder: Path, summary: Mapping[str, Any], metrics_csv: str) -> None:
+def write(folder: Path, summary: RunSummary, metrics_csv: str) -> None:
     """Write `summary.json` and `metrics.csv` into a run's folder."""
     atomic_write(folder / run_folder.METRICS, metrics_csv)
-    text = json.dumps(summary, indent=2, allow_nan=False)
-    atomic_write(folder / run_folder.SUMMARY, text + '\n')
+    run_summary.write(folder, summary)
 
 
-def _from_role(reports: Mapping[str, Report], role: str, key: str) -> Any:
-    found = [report.get(key) for report in reports.values() if report.get('role') == role]
-    return next((value for value in found if value is not None), None)
+def _first(values: Iterable[_T | None]) -> _T | None:
+    """The first that is known."""
+    return next((value for value in values if value is not None), None)

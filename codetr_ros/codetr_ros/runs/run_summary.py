@@ -1,0 +1,158 @@
+"""The content of a run's `summary.json`: a model with a description of every field."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from pydantic import Field, JsonValue
+
+from codetr_ros.runs import facts
+from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs.facts import Counts, Facts, Number
+from codetr_ros.system.files import atomic_write
+
+FAULTS = ('lost', 'duplicated', 'refused')
+
+
+class Evaluation(Facts):
+    """How a policy did in the episodes of one evaluation."""
+
+    step: int = Field(description='training steps that the policy has learnt from')
+    version: int = Field(description='version of the policy; -1: random')
+    true_return_mean: Number = Field(
+        description="mean of the episodes' true returns, in the environment's own rewards"
+    )
+    true_return_std: Number = Field(description='their standard deviation')
+    true_return_min: Number = Field(description='the lowest of them')
+    true_return_max: Number = Field(description='the highest of them')
+    composite_return_mean: Number = Field(
+        description="mean of the episodes' composite returns: the sums of their composite rewards"
+    )
+    score_mean: Number = Field(
+        description="mean of the episodes' scores: composite return over that of an agent that "
+        "earns the task's largest reward at every step"
+    )
+    score_std: Number = Field(description='their standard deviation')
+    length_mean: Number = Field(description='mean length of the episodes [steps]')
+    episodes: int = Field(description='how many episodes there were')
+
+
+class RewardRecovery(Facts):
+    """How well labels agree with the environment's own rewards when a policy was evaluated."""
+
+    step: int = Field(description='training steps that the policy has learnt from')
+    pearson: Number = Field(
+        description='correlation over all steps; null where one side does not vary'
+    )
+    within: Number = Field(
+        description="correlation after each segment's mean was taken from both sides"
+    )
+    spearman: Number = Field(description='rank correlation over all steps')
+    steps: int = Field(description='how many labelled steps were compared')
+
+
+class MessageCounts(Facts):
+    """How many messages a topic carried, and what became of them."""
+
+    published: int = Field(description='by all nodes')
+    recorded: int = Field(description='in the bag')
+    received_by_learner: int = Field(description='that reached the learner')
+    received_by_reward: int = Field(description='that reached the reward node')
+    lost: int = Field(description='that never reached a node that reads the topic')
+    duplicated: int = Field(description='that reached a node more than once')
+    refused: int = Field(description='that a node refused')
+
+
+class ProcessUse(Facts):
+    """What a process took, and how it ended; null where that is not known."""
+
+    role: str | None = Field(description='role of its node; `codetr` is the command itself')
+    peak_rss_mb: float | None = Field(description='most memory that it had at once [MB]')
+    cpu_s: float | None = Field(description='processor time [s]')
+    wall_s: float | None = Field(description='time from its start to its end [s]')
+    finished: bool | None = Field(description='whether all that the run asked of it was done')
+    error: str | None = Field(description='why it gave up')
+    exit_code: int | None = Field(description='exit code; -N: ended by signal N')
+
+
+class RunSummary(Facts):
+    """What a run was, how it went and what came out: the content of `summary.json`."""
+
+    run_id: str = Field(description='name of the run')
+    task: str = Field(description='what was simulated')
+    composite: str = Field(description="how a segment's rewards made its composite reward")
+    delay: int = Field(description='length n of a segment [steps]')
+    method: str = Field(description='how step rewards were made from composite rewards')
+    seed: int = Field(description='seed of everything random')
+    overlap: bool = Field(description='whether simulation ran a phase ahead of learning')
+    in_process: bool = Field(description='whether it ran in one process, without topics')
+    interrupted: bool = Field(description='whether somebody ended it before it had finished')
+    failure: str | None = Field(description='why it failed; null if it did not')
+    steps: int = Field(description='environment steps of the committed phases')
+    steps_planned: int = Field(description='environment steps that it was to take')
+    phases: int = Field(description='phases that were committed')
+    phases_planned: int = Field(description='phases that it was to have')
+    wall_s: float = Field(description='time that it took, the start of its processes included [s]')
+    steps_per_s: float | None = Field(description='environment steps per second of that time')
+    evaluations: list[Evaluation] = Field(description='in the order of training steps')
+    random: Evaluation | None = Field(
+        description='how the uniformly random policy did; null if it was not evaluated'
+    )
+    reward_recovery: list[RewardRecovery] = Field(
+        [],
+        description='whenever a policy was due for evaluation and there were labels; summaries of '
+        'the first versions lack it',
+    )
+    random_score: Number = Field(description='mean score of the random policy')
+    final_score: Number = Field(description='mean score of the last evaluation')
+    random_true_return: Number = Field(description='mean true return of the random policy')
+    final_true_return: Number = Field(description='mean true return of the last evaluation')
+    policy_sha256: str | None = Field(description="digest of the final policy's weights")
+    reward_model_sha256: str | None = Field(description="digest of the reward model's weights")
+    updates: int | None = Field(description='SAC updates taken')
+    gradient_steps: int | None = Field(description='gradient steps of the reward model')
+    messages: dict[str, MessageCounts] = Field(description='counts of messages, by topic')
+    lost: int = Field(description='lost messages, all topics together')
+    duplicated: int = Field(description='duplicated messages, all topics together')
+    refused: int = Field(description='refused messages, all topics together')
+    bag: str | None = Field(description="folder of the run's bag; null without one")
+    processes: dict[str, ProcessUse] = Field(
+        description='what each process took, by `<role>-<name>` of its node'
+    )
+    counters: dict[str, Counts] = Field(
+        description='what else the nodes counted, by `<role>-<name>` of the node'
+    )
+    versions: dict[str, str | None] = Field(
+        description='versions of what decides the numbers; null for what is not installed'
+    )
+    settings_hash: str = Field(description="sha256 of the settings' canonical JSON")
+    settings: dict[str, JsonValue] = Field(description='every setting of the run')
+
+    @property
+    def complete(self) -> bool:
+        """Whether all that was planned was done."""
+        return self.steps == self.steps_planned and not self.interrupted and not self.failure
+
+    def evaluated(self) -> Sequence[Evaluation]:
+        """The random policy, where it was evaluated, and all evaluations after it."""
+        return [*([self.random] if self.random else []), *self.evaluations]
+
+
+def write(folder: Path, summary: RunSummary) -> None:
+    """Write `summary.json` into a run's folder."""
+    text = json.dumps(summary.model_dump(mode='json'), indent=2, allow_nan=False)
+    atomic_write(folder / run_folder.SUMMARY, text + '\n')
+
+
+def read(path: Path) -> RunSummary:
+    """Read a `summary.json`, of this version of the program or of an earlier one.
+
+    Raises:
+        RunFolderError: it is damaged, or not the summary of a run.
+    """
+    return facts.read(
+        RunSummary,
+        path,
+        'summary',
+        'give the folder of a run that `codetr train` has made',
+    )
