@@ -5,7 +5,10 @@ from codetr_ros.benchmark.attempt import Job
 from codetr_ros.benchmark.folder import Folder
 from codetr_ros.benchmark.overview import Overview
 
-JOBS = [Job(f'cell_seed{i}', 'hash', 1000, 10, 1) for i in range(4)]
+JOBS = [
+    Job(cell=f'cell_seed{i}', settings_hash='hash', steps=1000, phases=10, threads=1)
+    for i in range(4)
+]
 GOOD = {'error': None, 'log': None}
 
 

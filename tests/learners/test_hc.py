@@ -1,6 +1,7 @@
 """HC: what it draws, how it values histories, and one update held against a plain re-statement."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -64,13 +65,13 @@ def make_batch(seed: int = 0) -> HistoryBatch:
     for i, length in enumerate(lengths):
         observations[i, length + 1 :] = actions[i, length:] = 0
     return HistoryBatch(
-        observations,
-        actions,
-        lengths,
-        np.array([3.0, -5.0, 8.0]),
-        np.array([False, True, False]),
-        np.array([0, 1, 2, 0, 1, 2, 2]),
-        np.array([0, 1, 3, 3, 0, 1, 2]),
+        observations=observations,
+        actions=actions,
+        lengths=lengths,
+        values=np.array([3.0, -5.0, 8.0]),
+        terminal=np.array([False, True, False]),
+        owners=np.array([0, 1, 2, 0, 1, 2, 2]),
+        steps=np.array([0, 1, 3, 3, 0, 1, 2]),
     )
 
 
@@ -299,12 +300,10 @@ def test_a_learner_goes_on_from_its_state_as_if_nothing_had_been(history: str) -
         torch.manual_seed(index)
         made = make_batch(index)
         hc.update(
-            HistoryBatch(
-                made.observations.astype(np.float32),
-                made.actions.astype(np.float32),
-                *(getattr(made, name) for name in ('lengths', 'values', 'terminal')),
-                made.owners,
-                made.steps,
+            replace(
+                made,
+                observations=made.observations.astype(np.float32),
+                actions=made.actions.astype(np.float32),
             )
         )
         return hc.state()

@@ -28,7 +28,7 @@ ERROR_LINES = 15
 """Lines of its log that a failed cell is reported with."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Job:
     """What a worker must know of a cell.
 

@@ -79,7 +79,15 @@ def _todo(spec: Spec, folder: Folder, retry_failed: bool) -> tuple[list[Job], di
             failed[cell.name] = folder.error(cell.name)
         elif state != 'finished':
             threads = max(settings.threads, min(settings.envs, processors.count()))
-            jobs.append(Job(cell.name, settings.hash(), settings.steps, settings.phases, threads))
+            jobs.append(
+                Job(
+                    cell=cell.name,
+                    settings_hash=settings.hash(),
+                    steps=settings.steps,
+                    phases=settings.phases,
+                    threads=threads,
+                )
+            )
     return jobs, failed
 
 

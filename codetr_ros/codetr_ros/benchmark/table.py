@@ -22,7 +22,7 @@ ORACLES = ('true',)
 Pair = tuple[int, int]  # seed, delay
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Entry:
     """A method in a row.
 
@@ -113,16 +113,20 @@ def _entry(method: str, results: Sequence[Result]) -> Entry:
     for (_, delay), score in scores.items():
         strata[delay].append(score)
     values = list(scores.values())
+    mean, spread = _mean_and_spread(scores)
+    return_mean, return_spread = _mean_and_spread(returns)
     return Entry(
-        method,
-        scores,
-        returns,
-        len(results),
-        sum(result.state == 'failed' for result in results),
-        *_mean_and_spread(scores),
-        *_mean_and_spread(returns),
-        interquartile_mean(values) if values else None,
-        interquartile_interval(list(strata.values())) if values else None,
+        method=method,
+        scores=scores,
+        returns=returns,
+        planned=len(results),
+        failed=sum(result.state == 'failed' for result in results),
+        mean=mean,
+        spread=spread,
+        return_mean=return_mean,
+        return_spread=return_spread,
+        iqm=interquartile_mean(values) if values else None,
+        interval=interquartile_interval(list(strata.values())) if values else None,
     )
 
 
@@ -155,7 +159,7 @@ def compare(entries: Sequence[Entry]) -> tuple[Entry, ...]:
     return tuple(compared)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Aggregate:
     """The interquartile mean of a method's scores on a task, with its interval.
 
@@ -189,12 +193,12 @@ def aggregate(together: Sequence[Row]) -> list[Aggregate]:
             values = [score for scores in of.values() for score in scores]
             found.append(
                 Aggregate(
-                    task,
-                    method,
-                    tuple(dict.fromkeys(composite for composite, _ in of)),
-                    interquartile_mean(values),
-                    interquartile_interval(list(of.values())),
-                    len(values),
+                    task=task,
+                    method=method,
+                    composites=tuple(dict.fromkeys(composite for composite, _ in of)),
+                    iqm=interquartile_mean(values),
+                    interval=interquartile_interval(list(of.values())),
+                    cells=len(values),
                 )
             )
     return found

@@ -18,7 +18,7 @@ from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import F32, F64, I64
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class HistoryBatch:
     """Steps with their whole segments, which are padded with zeros on the right to L steps."""
 
@@ -54,13 +54,13 @@ class ScoredSteps:
         whole = self._memory.segments.batch(ids)
         owners = np.arange(batch, dtype=np.int64) % segments
         return HistoryBatch(
-            whole.observations,
-            whole.actions,
-            whole.lengths,
-            whole.values,
-            self._memory.segments.terminal(ids),
-            owners,
-            rng.integers(0, whole.lengths[owners]),
+            observations=whole.observations,
+            actions=whole.actions,
+            lengths=whole.lengths,
+            values=whole.values,
+            terminal=self._memory.segments.terminal(ids),
+            owners=owners,
+            steps=rng.integers(0, whole.lengths[owners]),
         )
 
 

@@ -87,7 +87,7 @@ def value_network(inputs: int, hidden: Sequence[int]) -> nn.Sequential:
     return body.extend(head)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class PhaseBatch:
     """A phase's steps, with all that stays as it is while they are learnt from."""
 
@@ -193,16 +193,16 @@ class Lirpg:
                 ]
             )
             return PhaseBatch(
-                x,
-                a,
-                u,
-                self.log_probs(list(self.actor.parameters()), x, u),
-                r,
-                self.value(x).squeeze(-1),
-                goes_on * self.value(x2).squeeze(-1),
-                stretch_ends,
-                advantages,
-                advantages + v,
+                observations=x,
+                actions=a,
+                squashed=u,
+                log_probs=self.log_probs(list(self.actor.parameters()), x, u),
+                rewards=r,
+                values=self.value(x).squeeze(-1),
+                following=goes_on * self.value(x2).squeeze(-1),
+                ends=stretch_ends,
+                advantages=advantages,
+                returns=advantages + v,
             )
 
     def update(self, batch: PhaseBatch, indices: Tensor) -> dict[str, Tensor]:

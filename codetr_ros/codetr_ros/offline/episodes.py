@@ -276,7 +276,7 @@ class Segments(NamedTuple):
     values: np.ndarray
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Stretch:
     """Part of an episode with its scored segments: held out or learnt from as a whole."""
 
@@ -349,6 +349,14 @@ def _cut(episode: Episode, piece: Piece, segments: Segments, longest: int) -> li
         last = upto == len(ends)
         end = int(ends[upto - 1]) if not last or piece.end - begin > longest else piece.end
         mine = Segments(*(part[at:upto] for part in segments))
-        found.append(Stretch(episode.key, episode.number, begin, end - begin, mine))
+        found.append(
+            Stretch(
+                key=episode.key,
+                episode=episode.number,
+                first=begin,
+                steps=end - begin,
+                segments=mine,
+            )
+        )
         begin, at = end, upto
     return found

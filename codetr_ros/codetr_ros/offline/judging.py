@@ -21,7 +21,7 @@ SHOWN = 6
 """Segments of which a report shows every step."""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Shown:
     """Every step of one segment, for a picture."""
 
@@ -35,7 +35,7 @@ class Shown:
     weights: F32 | None  # attention weights w, 1 on average
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Judgement:
     """What a method makes of the segments of a memory."""
 
@@ -73,12 +73,12 @@ def judge(method: RewardMethod, loaded: Loaded) -> Judgement:
         **step_recovery(labels[known], true[known], inside[known]),
     }
     return Judgement(
-        {name: None if np.isnan(value) else value for name, value in metrics.items()},
-        values,
-        predicted,
-        labels[known][inside[known]],
-        true[known][inside[known]],
-        _shown(method, loaded, ids, labels, true, known, predicted),
+        metrics={name: None if np.isnan(value) else value for name, value in metrics.items()},
+        values=values,
+        predicted=predicted,
+        labels=labels[known][inside[known]],
+        true=true[known][inside[known]],
+        shown=_shown(method, loaded, ids, labels, true, known, predicted),
     )
 
 
@@ -127,14 +127,14 @@ def _shown(
         weights = method.step_weights(batch)
         found.append(
             Shown(
-                stretch.key.source,
-                stretch.episode,
-                stretch.first + int(firsts[i]),
-                float(batch.values[0]),
-                float(predicted[i]) if predicted is not None else None,
-                labels[i, :length],
-                true[i, :length] if known[i] else None,
-                None if weights is None else weights[0, batch.context[0] :],
+                source=stretch.key.source,
+                episode=stretch.episode,
+                first=stretch.first + int(firsts[i]),
+                value=float(batch.values[0]),
+                predicted=float(predicted[i]) if predicted is not None else None,
+                labels=labels[i, :length],
+                true=true[i, :length] if known[i] else None,
+                weights=None if weights is None else weights[0, batch.context[0] :],
             )
         )
     return found

@@ -28,7 +28,7 @@ class TaskError(ValueError):
     """A task that is unknown, cannot be used or misbehaves: names task, field and remedy."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Task:
     """What a name stands for.
 

@@ -19,13 +19,22 @@ __all__ = ['TASKS', 'Environment', 'Task', 'TaskError', 'check', 'find', 'make',
 
 
 def _gymnasium(name: str, r_max: float, note: str, horizon: int = 1000) -> Task:
-    return Task(name, name, 'gymnasium', horizon, r_max, note)
+    return Task(
+        name=name,
+        environment_id=name,
+        library='gymnasium',
+        horizon=horizon,
+        r_max=r_max,
+        note=note,
+    )
 
 
 def _dm_control(name: str, note: str) -> Task:
     # every reward of the suite lies in [0, 1], and every episode has 1000 control steps (Tassa et
     # al., 2018)
-    return Task(name, name, 'dm_control', 1000, 1.0, note)
+    return Task(
+        name=name, environment_id=name, library='dm_control', horizon=1000, r_max=1.0, note=note
+    )
 
 
 # The paper lists no r_max ("maximum possible reward in the environment"). Where the reward has no
@@ -96,7 +105,14 @@ def find(name: str) -> Task:
             '`codetr tasks` lists'
         )
     note = 'r_max is not known: 1.0, unless the setting r_max gives another unit of scores'
-    return Task(name, name, 'gymnasium', spec.max_episode_steps, 1.0, note)
+    return Task(
+        name=name,
+        environment_id=name,
+        library='gymnasium',
+        horizon=spec.max_episode_steps,
+        r_max=1.0,
+        note=note,
+    )
 
 
 def _close_to(name: str, others: dict[str, Any]) -> str:
