@@ -19,6 +19,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from codetr_ros.config import load
+from codetr_ros.records.roles import TABLE
 
 ARGUMENTS = {
     'namespace': ('codetr', 'namespace of the run; each run needs one of its own'),
@@ -27,31 +28,22 @@ ARGUMENTS = {
     'folder': ('', 'folder for bag, checkpoints and reports; empty: nothing is written'),
     'peer_deadline': ('60.0', 'seconds that nodes wait for each other'),
 }
-NODES = (
-    ('sim_node', 'sim'),
-    ('sim_node', 'evaluate'),
-    ('reward_node', 'reward'),
-    ('codetr_ros', 'record'),
-    ('learner_node', 'learner'),
-)
 
 
 def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     """The nodes; only the learner is told what to do, the others take it from the run."""
     value = {name: LaunchConfiguration(name) for name in ARGUMENTS}
     shared = {name: value[name] for name in ('folder', 'run_id', 'peer_deadline')}
-    needed = load(value['config'].perform(context)).roles
     found = {
-        executable: Node(
-            package=package,
-            executable=executable,
-            name=executable,
+        role: Node(
+            package=TABLE[role].package,
+            executable=TABLE[role].executable,
+            name=TABLE[role].executable,
             namespace=value['namespace'],
             output='screen',
-            parameters=[shared | ({'config': value['config']} if executable == 'learner' else {})],
+            parameters=[shared | ({'config': value['config']} if role == 'learner' else {})],
         )
-        for package, executable in NODES
-        if executable in needed
+        for role in load(value['config'].perform(context)).roles
     }
     end = RegisterEventHandler(
         OnProcessExit(

@@ -14,6 +14,7 @@ from codetr_ros import cli, config
 from codetr_ros.cli import doctor, flags, train
 from codetr_ros.config import Settings, SettingsError
 from codetr_ros.processes import launcher
+from codetr_ros.records import ROLES
 from codetr_ros.runs import folder as run_folder
 from helpers.executables import prefix
 
@@ -327,7 +328,7 @@ def test_the_run_over_topics_fails_with_the_log_of_the_node_that_died(
         f'#!{sys.executable}\nimport signal, sys\n'
         'signal.signal(signal.SIGINT, lambda *_: sys.exit(0))\nsignal.pause()\n'
     )
-    for role in launcher.EXECUTABLES:
+    for role in ROLES:
         launcher.executable(role).write_text(waits)
     launcher.executable('reward').write_text('#!/bin/sh\necho out of patience >&2\nexit 7\n')
 

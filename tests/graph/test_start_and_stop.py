@@ -14,7 +14,7 @@ from rcl_interfaces.msg import ParameterType
 from rosbags.highlevel import AnyReader
 
 from codetr_ros.records import TOPICS, TrueRewards
-from codetr_ros.ros import peers
+from codetr_ros.records.roles import command, readers
 from codetr_ros.runs import checkpoints
 from codetr_ros.runs import folder as run_folder
 from helpers.builders import tiny
@@ -76,7 +76,7 @@ def test_missing_nodes_are_named_with_what_starts_them_and_not_waited_for_in_sil
     assert codes == {'learner': 1}
     assert f'{NAMESPACE}/learner gave up after 1 s: it waits for ' in said
     for role in ('sim', 'evaluate', 'reward', 'record'):
-        assert f'{role} (start it with `{peers.COMMANDS[role]}` in this namespace)' in said
+        assert f'{role} (start it with `{command(role)}` in this namespace)' in said
     assert 'Parameter peer_deadline makes it wait longer' in said
     assert 'Traceback' not in said
     assert nodes.report('learner')['error'] in said
@@ -166,7 +166,7 @@ def test_a_signal_leaves_a_checkpoint_and_a_closed_bag(stopped):
 
 def test_only_the_recorder_hears_the_true_rewards(stopped):
     assert stopped.readers[TOPICS[TrueRewards]] == {'record'}
-    for topic, roles in peers.READERS.items():
+    for topic, roles in readers().items():
         assert stopped.readers[topic] - {'witness'} >= set(roles), topic
 
 

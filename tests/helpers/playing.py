@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from codetr_ros.records import TOPICS, Presence, RunSpec
-from codetr_ros.ros import peers
+from codetr_ros.records.roles import published_by, readers
 from codetr_ros.ros.link import Link
 from helpers.builders import policy, score, task_spec, transitions
 
@@ -56,9 +56,9 @@ class Play:
         self.heard = []
         self.links = {role: Link(role) for role in roles}
         for role, link in self.links.items():
-            link.advertise(['presence', *peers.published_by(role)], settings)
+            link.advertise(['presence', *published_by(role)], settings)
             for kind in TOPICS:
-                if role in peers.READERS.get(TOPICS[kind], ()) or kind in (Presence, RunSpec):
+                if role in readers().get(TOPICS[kind], ()) or kind in (Presence, RunSpec):
                     link.subscribe(
                         kind,
                         lambda kind, message, role=role: self.heard.append((role, message)),
@@ -71,7 +71,7 @@ class Play:
 
     def say(self):
         for role, link in self.links.items():
-            topics = peers.published_by(role)
+            topics = published_by(role)
             counts = [link.published[t] + self.claimed.get(t, 0) for t in topics]
             link.publish(
                 Presence(

@@ -12,6 +12,7 @@ from catkin_pkg.package import parse_package
 
 import bootstrap
 from codetr_ros import records
+from codetr_ros.records.roles import TABLE
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON_PACKAGES = bootstrap.PACKAGES[1:]
@@ -111,6 +112,12 @@ def test_constants_of_messages_are_those_of_the_records():
     assert f'PROTOCOL_VERSION={records.PROTOCOL_VERSION} ' in text
     assert f'INITIAL_VERSION={records.INITIAL_VERSION} ' in text
     assert tuple(re.findall(r'string ROLE_\w+=(\w+)', text)) == records.ROLES
+
+
+@pytest.mark.parametrize('role', records.ROLES)
+def test_what_starts_a_role_is_a_command_of_its_package(role: str):
+    row = TABLE[role]
+    assert row.executable in scripts(row.package)
 
 
 @pytest.mark.parametrize('name', [*bootstrap.REQUIREMENTS, bootstrap.WITHOUT_DEPENDENCIES])

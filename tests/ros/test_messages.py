@@ -21,7 +21,8 @@ from codetr_ros.records import (
     Transitions,
     TrueRewards,
 )
-from codetr_ros.ros import messages, peers, qos
+from codetr_ros.records.roles import WRITERS, readers
+from codetr_ros.ros import messages, qos
 from helpers.builders import run, same, tiny, transitions
 
 STAMP = Time(sec=3, nanosec=4)
@@ -201,7 +202,7 @@ def test_a_number_that_does_not_fit_its_field_is_not_sent():
 def test_every_topic_has_a_quality_of_service_readers_and_writers():
     topics = set(TOPICS.values())
     assert set(qos.QUALITIES) == topics
-    assert set(peers.READERS) == set(peers.WRITERS) == topics - {'presence'}
+    assert set(readers()) == set(WRITERS) == topics - {'presence'}
 
 
 @pytest.mark.parametrize('method', ['codetr', 'hc'])
@@ -219,10 +220,10 @@ def test_the_roles_that_read_a_topic_are_those_whose_cores_want_it(method):
         'reward': Labeller.subscribes,
         'learner': Learner(spec, settings, 'learner', None).subscribes,
     }
-    readers = peers.readers(settings)
+    reading = readers(settings.labels_steps)
     for role in settings.roles.keys() & wanted:
         topics = {TOPICS[kind] for kind in wanted[role]} - {'run'}
-        assert topics == {t for t, roles in readers.items() if role in roles and t != 'run'}
+        assert topics == {t for t, roles in reading.items() if role in roles and t != 'run'}
 
 
 def test_a_run_that_learns_from_scores_itself_needs_no_reward_node():

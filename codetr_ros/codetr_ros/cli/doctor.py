@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
-from codetr_ros.records import PROTOCOL_VERSION
+from codetr_ros.records import PROTOCOL_VERSION, ROLES
 from codetr_ros.system import compilation, processors
 from codetr_ros.system.versions import version_of
 
@@ -98,7 +98,7 @@ def executables() -> Check:
     from codetr_ros.processes import launcher
 
     try:
-        found = [launcher.executable(role) for role in launcher.EXECUTABLES]
+        found = [launcher.executable(role) for role in ROLES]
     except launcher.LaunchError as error:
         return Check('nodes', 'fail', str(error).split(':')[0], _INSTALL)
     return Check('nodes', 'ok', f'{len(found)} executables in {found[0].parents[1]}')

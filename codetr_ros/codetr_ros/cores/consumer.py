@@ -10,6 +10,7 @@ import torch
 
 from codetr_ros import records
 from codetr_ros.config import Settings
+from codetr_ros.cores.core import Part
 from codetr_ros.cores.intake import Intake
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import Metrics, Record, RunSpec
@@ -17,7 +18,7 @@ from codetr_ros.runs import checkpoints
 from codetr_ros.runs.reports import CoreReport, MemoryFacts
 
 
-class Consumer(ABC):
+class Consumer(Part, ABC):
     """A core that takes phases into its memory D, in order, and learns from each.
 
     Args:
@@ -40,6 +41,7 @@ class Consumer(ABC):
         scores: bool,
         true_rewards: bool = False,
     ) -> None:
+        super().__init__()
         self._run = run
         self._settings = settings
         self._name = name
@@ -51,12 +53,7 @@ class Consumer(ABC):
         self._saved = -1
         self._counters: Counter[str] = Counter()
         self.duplicated = self._intake.duplicated
-        self.finished = False
-
-    @property
-    def refused(self) -> 'Counter[str]':
-        """Records left out of a committed phase, by topic."""
-        return self._intake.refused
+        self.refused = self._intake.refused
 
     @property
     def missing(self) -> int | None:

@@ -4,8 +4,10 @@ from collections import Counter, deque
 from collections.abc import Iterator
 
 from codetr_ros.config import Settings
+from codetr_ros.cores.core import Part
 from codetr_ros.policy.acting import ActingPolicy, uniform_actions
-from codetr_ros.records import INITIAL_VERSION, EpisodeResult, Policy, Record, RunSpec
+from codetr_ros.records import INITIAL_VERSION, EpisodeResult, Record, RunSpec
+from codetr_ros.records.roles import subscribed
 from codetr_ros.runs.reports import CoreReport
 from codetr_ros.seeding import generator
 from codetr_ros.simulation.episode import Episode
@@ -13,7 +15,7 @@ from codetr_ros.simulation.permission import acting_policy, check_policy
 from codetr_ros.simulation.tasks import make
 
 
-class Evaluator:
+class Evaluator(Part):
     """Evaluates policy versions: `evaluate_episodes` episodes each, with deterministic actions.
 
     Every evaluation of a run begins its episodes in the same start states. The first is that of
@@ -30,9 +32,10 @@ class Evaluator:
         SettingsError: the delay exceeds the task's horizon.
     """
 
-    subscribes: tuple[type, ...] = (Policy,)
+    subscribes = subscribed('evaluate')
 
     def __init__(self, run: RunSpec, settings: Settings, name: str) -> None:
+        super().__init__()
         self._run = run
         self._settings = settings
         self._name = name
@@ -44,7 +47,6 @@ class Evaluator:
         self._seen: set[int] = set()  # versions that are evaluated or wait for it
         self._counters: Counter[str] = Counter()
         self._closed = False
-        self.finished = False
 
     def receive(self, record: Record) -> None:
         """Keep a policy whose version is due for evaluation.

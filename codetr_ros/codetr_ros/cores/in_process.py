@@ -54,7 +54,7 @@ def run(
     torch.set_num_threads(settings.threads)
     spec = settings.run_spec(run_id)
     checkpoints = folder / run_folder.CHECKPOINTS if folder else None
-    cores: dict[str, tuple[str, Core]] = {
+    cores: dict[str, tuple[str, Core[Record]]] = {
         name: ('sim', Simulator(spec, settings, name)) for name in settings.simulator_names
     }
     cores['record'] = ('record', Recorder(spec, settings, 'record'))

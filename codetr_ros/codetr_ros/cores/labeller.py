@@ -17,15 +17,12 @@ from codetr_ros.records import (
     F32,
     I64,
     MESSAGE_BYTES,
-    Commit,
-    CompositeReward,
     Record,
     RunSpec,
     StepRewards,
-    TaskSpec,
-    Transitions,
     TrueRewards,
 )
+from codetr_ros.records.roles import subscribed
 from codetr_ros.rewards import registry, saved
 from codetr_ros.rewards.base import RewardMethod, RewardModelError
 from codetr_ros.runs import checkpoints
@@ -50,7 +47,7 @@ class Labeller(Consumer):
     """
 
     role = 'reward'
-    subscribes: tuple[type, ...] = (TaskSpec, Transitions, CompositeReward, Commit)
+    subscribes = subscribed('reward')
 
     def __init__(
         self,

@@ -15,18 +15,15 @@ from codetr_ros.policy.actor import weights_bytes
 from codetr_ros.records import (
     INITIAL_VERSION,
     TOPICS,
-    Commit,
-    CompositeReward,
     Policy,
     Record,
     RecordError,
     RunSpec,
     StepRewards,
-    TaskSpec,
-    Transitions,
     describe,
 )
 from codetr_ros.records.checks import check_run
+from codetr_ros.records.roles import subscribed
 from codetr_ros.runs import checkpoints
 from codetr_ros.runs.reports import CoreReport
 from codetr_ros.system.devices import usable
@@ -46,12 +43,11 @@ class Learner(Consumer):
     """
 
     role = 'learner'
-    subscribes: tuple[type, ...] = (TaskSpec, Transitions, Commit, StepRewards)
+    subscribes = subscribed('learner')
 
     def __init__(self, run: RunSpec, settings: Settings, name: str, folder: Path | None) -> None:
         usable(settings.device)  # a device that is not here is said at once
-        if not settings.labels_steps:
-            self.subscribes = (TaskSpec, Transitions, CompositeReward, Commit)
+        self.subscribes = subscribed('learner', settings.labels_steps)
         super().__init__(run, settings, name, folder, scores=not settings.labels_steps)
         self._labels: dict[int, dict[int, StepRewards]] = {}
         self._learner: PolicyLearner | None = None

@@ -13,6 +13,7 @@ import numpy as np
 
 from codetr_ros.config import Settings
 from codetr_ros.cores.announced import Tasks
+from codetr_ros.cores.core import Part
 from codetr_ros.records import (
     TOPICS,
     Commit,
@@ -30,7 +31,7 @@ from codetr_ros.records.checks import check_run, check_score
 from codetr_ros.runs.reports import CoreReport
 
 
-class Recorder:
+class Recorder(Part):
     """Commits a phase once every permitted step and every due composite reward has arrived.
 
     Args:
@@ -42,6 +43,7 @@ class Recorder:
     subscribes: tuple[type, ...] = (TaskSpec, Policy, Transitions, CompositeReward)
 
     def __init__(self, run: RunSpec, settings: Settings, name: str) -> None:
+        super().__init__()
         self._run = run
         self._settings = settings
         self._name = name
@@ -52,9 +54,7 @@ class Recorder:
         self._transitions: Counter[str] = Counter()  # next sequence number of each source
         self._scores: Counter[str] = Counter()  # next sequence number of each scorer
         self._committed_scores: Counter[str] = Counter()
-        self.duplicated: Counter[str] = Counter()
         self.refused = self._tasks.refused
-        self.finished = False
         self.phase = 0  # the next to be committed
 
     def receive(self, record: Record) -> None:

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Iterator
 
 from codetr_ros.config import Settings
+from codetr_ros.cores.core import Part
 from codetr_ros.policy.acting import ActingPolicy
 from codetr_ros.records import (
     Metrics,
@@ -16,12 +17,13 @@ from codetr_ros.records import (
     describe,
     metrics,
 )
+from codetr_ros.records.roles import subscribed
 from codetr_ros.runs.reports import CoreReport
 from codetr_ros.simulation.permission import acting_policy, check_policy
 from codetr_ros.simulation.source import Source
 
 
-class Simulator:
+class Simulator(Part):
     """Rolls out a task under the policies that it receives, in the order of their phases.
 
     With the setting `envs` above 1 it has as many environments, and each is a source of its own:
@@ -43,9 +45,10 @@ class Simulator:
         SettingsError: the delay exceeds the task's horizon.
     """
 
-    subscribes: tuple[type, ...] = (Policy,)
+    subscribes = subscribed('sim')
 
     def __init__(self, run: RunSpec, settings: Settings, name: str) -> None:
+        super().__init__()
         self._run = run
         self._settings = settings
         self._name = name
@@ -54,7 +57,6 @@ class Simulator:
         self._phase = 0  # the next to be run
         self._counters: Counter[str] = Counter()
         self._closed = False
-        self.finished = False
 
     def receive(self, record: Record) -> None:
         """Keep a policy until its phase's turn.

@@ -18,16 +18,8 @@ from pathlib import Path
 
 from codetr_ros.config import Settings
 from codetr_ros.processes import middleware
+from codetr_ros.records import roles
 from codetr_ros.runs import folder as run_folder
-
-EXECUTABLES = {
-    'sim': ('sim_node', 'sim'),
-    'evaluate': ('sim_node', 'evaluate'),
-    'reward': ('reward_node', 'reward'),
-    'learner': ('learner_node', 'learner'),
-    'record': ('codetr_ros', 'record'),
-}
-"""Role -> package and executable, as `ros2 run` takes them."""
 
 STOP_DEADLINE = 20.0
 """Seconds from SIGINT to SIGKILL: a node ends its present slice, then writes a checkpoint."""
@@ -62,7 +54,7 @@ def executable(role: str, environ: Mapping[str, str] = os.environ) -> Path:
         LaunchError: it is in none of them; says where was looked and how to build or source the
             workspace.
     """
-    package, name = EXECUTABLES[role]
+    package, name = roles.TABLE[role].package, roles.TABLE[role].executable
     prefixes = [sys.prefix, *filter(None, environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep))]
     for prefix in prefixes:
         path = Path(prefix) / 'lib' / package / name

@@ -7,7 +7,6 @@ from codetr_ros.records.kinds import (
     INITIAL_VERSION,
     MESSAGE_BYTES,
     PROTOCOL_VERSION,
-    ROLES,
     TOPICS,
     U32,
     U64,
@@ -27,6 +26,7 @@ from codetr_ros.records.kinds import (
     describe,
     metrics,
 )
+from codetr_ros.records.roles import ROLES
 
 __all__ = [
     'F32',

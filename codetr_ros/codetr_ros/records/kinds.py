@@ -26,7 +26,6 @@ U32 = NDArray[np.uint32]
 I64 = NDArray[np.int64]
 U64 = NDArray[np.uint64]
 
-ROLES = ('sim', 'evaluate', 'reward', 'learner', 'record')
 INITIAL_VERSION = -1
 """Policy version of the untrained policy; version k is the policy published after training on
 phase k.
@@ -58,7 +57,7 @@ class Presence:
     """
 
     run_id: str
-    role: str  # one of ROLES
+    role: str  # one of `roles.ROLES`
     node: str  # fully qualified node name; its last part names the sources where role is 'sim'
     instance_id: str  # another one after each start of the process
     settings_hash: str  # empty while the node still waits for the run

@@ -7,13 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from codetr_ros.config import IN_PROCESS_ONLY, Settings, from_canonical
-from codetr_ros.records import Presence, RunSpec
+from codetr_ros.records import Commit, Presence, RunSpec
+from codetr_ros.records.roles import WRITERS, published_by, readers
 from codetr_ros.ros import parameters
 from codetr_ros.ros.errors import NodeError
 from codetr_ros.ros.fetch import Fetcher
 from codetr_ros.ros.member import Member
 from codetr_ros.ros.patience import NAME_EVERY
-from codetr_ros.ros.peers import WRITERS, published_by, readers
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.simulation import tasks
 
@@ -159,7 +159,7 @@ class Joining(Member):
         self.core = make_core(self.run_spec, self.settings, self.link.name, checkpoints, **more)
         self.link.advertise(published_by(self.role), self.settings)
         self.open_topics(self.settings)
-        if hasattr(self.core, 'missing'):
+        if Commit in self.core.subscribes:
             self._fetcher = Fetcher(self.link, self.run_spec.run_id, self._receive_again)
         self.log.info(
             f'run {self.run_spec.run_id}: task {self.settings.task}, method {self.settings.method}'
@@ -186,7 +186,7 @@ class Joining(Member):
         absent = self.peers.absent(self.settings, self.run_spec.settings_hash)
         if absent:
             return absent
-        reading = readers(self.settings)
+        reading = readers(self.settings.labels_steps)
         reads = [topic for topic, roles in reading.items() if self.role in roles]
         return self.link.unmatched(
             published_by(self.role), self._names(reading), readers=True

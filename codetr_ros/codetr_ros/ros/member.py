@@ -21,11 +21,12 @@ from codetr_ros.records import (
     RunSpec,
     describe,
 )
+from codetr_ros.records.roles import published_by
 from codetr_ros.ros import link, messages
 from codetr_ros.ros.errors import NodeError
 from codetr_ros.ros.fetch import Fetcher
 from codetr_ros.ros.link import Link
-from codetr_ros.ros.peers import Ledger, Peers, published_by
+from codetr_ros.ros.peers import Ledger, Peers
 from codetr_ros.ros.signals import Stop
 
 if TYPE_CHECKING:

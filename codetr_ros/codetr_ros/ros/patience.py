@@ -3,21 +3,12 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from codetr_ros.records.roles import TABLE
 from codetr_ros.ros.errors import NodeError
 from codetr_ros.ros.peers import Peers
 
 NAME_EVERY = 5.0  # [s] between two complaints about the same peers
 GRACE = 10.0  # [s] for what a peer published before it finished
-
-CANNOT_FINISH_BEFORE: dict[str, tuple[str, ...]] = {
-    'sim': ('learner',),
-    'evaluate': ('learner',),
-    'reward': ('record',),
-    'learner': ('reward', 'record'),
-    'record': ('sim', 'learner'),
-}
-"""Roles that have finished only if they were stopped, as long as a node of this role still waits
-for something."""
 
 
 class Patience:
@@ -90,7 +81,7 @@ class Patience:
                 self._log.warning(f'{who} has been silent for {silent:.0f} s; {doing}')
 
     def _check_finished(self, now: float, waiting: float, doing: str) -> None:
-        for role in CANNOT_FINISH_BEFORE[self._role]:
+        for role in TABLE[self._role].relies_on:
             gone = [peer for peer in self._peers.alive(role) if peer.said.finished]
             all_gone = gone and len(gone) == len(self._peers.alive(role))
             patience = GRACE if all_gone else max(GRACE, self._deadline)

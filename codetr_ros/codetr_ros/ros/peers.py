@@ -12,57 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from codetr_ros.config import Settings
-from codetr_ros.records import Presence
-
-READERS: dict[str, tuple[str, ...]] = {
-    'run': ('sim', 'evaluate', 'reward', 'record'),
-    'task': ('learner', 'reward', 'record'),
-    'policy': ('sim', 'evaluate', 'record'),
-    'transitions': ('record', 'reward', 'learner'),
-    'composite_rewards': ('record', 'reward'),
-    'commits': ('reward', 'learner'),
-    'step_rewards': ('learner', 'record'),
-    'episodes': ('record',),
-    'true_rewards': ('record',),
-    'metrics': ('record',),
-}
-"""Roles that must read what is published on a topic, where a reward node labels steps."""
-WRITERS: dict[str, tuple[str, ...]] = {
-    'run': ('learner',),
-    'task': ('sim',),
-    'policy': ('learner',),
-    'transitions': ('sim',),
-    'composite_rewards': ('sim',),
-    'commits': ('record',),
-    'step_rewards': ('reward',),
-    'episodes': ('sim', 'evaluate'),
-    'true_rewards': ('sim',),
-    'metrics': ('sim', 'evaluate', 'reward', 'learner', 'record'),
-}
-"""Roles that publish on a topic."""
-COMMANDS = {
-    'sim': 'ros2 run sim_node sim',
-    'evaluate': 'ros2 run sim_node evaluate',
-    'reward': 'ros2 run reward_node reward',
-    'learner': 'ros2 run learner_node learner',
-    'record': 'ros2 run codetr_ros record',
-}
-"""What starts a node of a role, for errors."""
-
-
-def readers(settings: Settings) -> dict[str, tuple[str, ...]]:
-    """Roles that must read what is published on a topic in a run with these settings."""
-    if settings.labels_steps:
-        return READERS
-    return READERS | {
-        'composite_rewards': (*READERS['composite_rewards'], 'learner'),
-        'step_rewards': ('record',),
-    }
-
-
-def published_by(role: str) -> tuple[str, ...]:
-    """Topics that a role publishes on."""
-    return tuple(topic for topic, roles in WRITERS.items() if role in roles)
+from codetr_ros.records import Presence, roles
 
 
 @dataclass
@@ -129,13 +79,14 @@ class Peers:
             if starting := [p.said.node for p in there if p not in ready]:
                 missing.append(f'{role}{of} ({", ".join(starting)} is there, but not ready yet)')
             else:
-                missing.append(f'{role}{of} (start it with `{COMMANDS[role]}` in this namespace)')
+                start = roles.command(role)
+                missing.append(f'{role}{of} (start it with `{start}` in this namespace)')
         return missing
 
     def awaited(self, topics: Iterable[str]) -> list[Peer]:
         """Peers that publish on one of these topics."""
-        roles = {role for topic in topics for role in WRITERS.get(topic, ())}
-        return [peer for role in sorted(roles) for peer in self.alive(role)]
+        writers = {role for topic in topics for role in roles.WRITERS.get(topic, ())}
+        return [peer for role in sorted(writers) for peer in self.alive(role)]
 
     def anybody_left(self) -> bool:
         """Whether some peer has not finished."""

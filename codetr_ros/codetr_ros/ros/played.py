@@ -7,9 +7,9 @@ from rclpy.logging import LoggingSeverity
 from codetr_ros.bags.playback import Recorded
 from codetr_ros.config import Settings
 from codetr_ros.records import TOPICS, Record
+from codetr_ros.records.roles import WRITERS, readers
 from codetr_ros.ros.joining import Joining
 from codetr_ros.ros.link import RECORDS_OF_TOPIC
-from codetr_ros.ros.peers import WRITERS, readers
 from codetr_ros.ros.signals import Stop
 from codetr_ros.runs.reports import CoreReport
 
@@ -40,7 +40,7 @@ def _must_read(role: str, settings: Settings, live: Collection[str]) -> list[typ
     """Kinds of records that live nodes insist on this role reading."""
     return [
         RECORDS_OF_TOPIC[topic]
-        for topic, roles in readers(settings).items()
+        for topic, roles in readers(settings.labels_steps).items()
         if role in roles and set(WRITERS[topic]) & set(live)
     ]
 

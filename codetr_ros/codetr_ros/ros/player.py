@@ -22,12 +22,13 @@ from rclpy.signals import SignalHandlerOptions
 from codetr_ros.bags.playback import Item, Pace, Playback, Recorded
 from codetr_ros.config import Settings
 from codetr_ros.records import TOPICS, Commit, EpisodeResult, Metrics, RunSpec
+from codetr_ros.records.roles import WRITERS
 from codetr_ros.ros import signals
 from codetr_ros.ros.errors import NodeError
 from codetr_ros.ros.link import Link
 from codetr_ros.ros.member import MakeCore
 from codetr_ros.ros.node import CoreNode
-from codetr_ros.ros.peers import WRITERS, Peer
+from codetr_ros.ros.peers import Peer
 from codetr_ros.ros.played import Played, PlayedRole
 from codetr_ros.ros.resend import Resender
 from codetr_ros.ros.signals import Stop

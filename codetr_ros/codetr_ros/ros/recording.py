@@ -22,9 +22,9 @@ from codetr_ros.bags.writer import McapWriter
 from codetr_ros.config import Settings
 from codetr_ros.records import TOPICS, Commit, Presence, Record, RecordError, RunSpec, StepRewards
 from codetr_ros.records.checks import check_run
+from codetr_ros.records.roles import published_by
 from codetr_ros.ros import messages, qos
 from codetr_ros.ros.node import CoreNode, MakeCore
-from codetr_ros.ros.peers import published_by
 from codetr_ros.ros.resend import Resender
 from codetr_ros.ros.signals import Stop
 from codetr_ros.runs import folder as run_folder

@@ -1,0 +1,95 @@
+"""What follows from the settings of a run: phases, shares, sources, evaluations."""
+
+from typing import TYPE_CHECKING
+
+from codetr_ros.records import roles
+
+
+class Schedule:
+    """The arithmetic of a run, mixed into its settings."""
+
+    if TYPE_CHECKING:  # fields of `Settings`: annotated otherwise, they would come first there
+        steps: int
+        phase_steps: int
+        warmup_steps: int
+        overlap: bool
+        simulators: int
+        envs: int
+        evaluate_every: int
+
+        @property
+        def labels_steps(self) -> bool:
+            """Whether a reward method labels steps."""
+
+    @property
+    def phases(self) -> int:
+        """Phases of the run; the last may be shorter."""
+        return -(-self.steps // self.phase_steps)
+
+    @property
+    def warmup_phases(self) -> int:
+        """Phases under the random policy: a phase begun is ended so."""
+        return min(self.phases, -(-self.warmup_steps // self.phase_steps))
+
+    @property
+    def lag(self) -> int:
+        """Phases from what taught a policy to where it acts: 1 in lock-step, 2 with overlap."""
+        return 2 if self.overlap else 1
+
+    def steps_of(self, phase: int) -> int:
+        """Environment steps of a phase, all sources together; 0 beyond the last."""
+        return max(0, min(self.phase_steps, self.steps - phase * self.phase_steps))
+
+    def shares_of(self, phase: int) -> list[int]:
+        """Steps that each source takes of a phase: the first ones take one more where it does not
+        divide.
+        """
+        share, rest = divmod(self.steps_of(phase), self.source_count)
+        return [share + (i < rest) for i in range(self.source_count)]
+
+    def steps_after(self, version: int) -> int:
+        """Environment steps that policy version `version` has learnt from."""
+        return min(self.steps, (version + 1) * self.phase_steps)
+
+    def evaluated(self, version: int) -> bool:
+        """Whether this policy version is evaluated: the last one, and the first past each
+        multiple.
+
+        Policies of the warm-up act at random and are not evaluated again: the random policy is,
+        once, at step 0.
+        """
+        if self.evaluate_every == 0 or version < self.warmup_phases - 1:
+            return False
+        if version == self.phases - 1:
+            return True
+        return (
+            self.steps_after(version) // self.evaluate_every
+            > self.steps_after(version - 1) // self.evaluate_every
+        )
+
+    @property
+    def simulator_names(self) -> tuple[str, ...]:
+        """Names that `codetr train` gives the run's simulators: sim, sim_2, sim_3, ..."""
+        return ('sim', *(f'sim_{i}' for i in range(2, self.simulators + 1)))
+
+    @property
+    def source_count(self) -> int:
+        """Sources of the run: environments of all simulators."""
+        return self.simulators * self.envs
+
+    def sources_of(self, simulator: str) -> tuple[str, ...]:
+        """Names of a simulator's sources: its own where it has one environment; sim-1, sim-2, ...
+        where it has several.
+        """
+        if self.envs == 1:
+            return (simulator,)
+        return tuple(f'{simulator}-{i}' for i in range(1, self.envs + 1))
+
+    def simulator_of(self, source: str) -> str:
+        """The simulator whose source it is. No node's name has a hyphen."""
+        return source if self.envs == 1 else source.rpartition('-')[0]
+
+    @property
+    def roles(self) -> dict[str, int]:
+        """How many nodes of each role the run needs."""
+        return roles.needed(self)

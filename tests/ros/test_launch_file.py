@@ -1,0 +1,48 @@
+"""The launch file: which nodes it starts, and what it gives them."""
+
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip('launch_ros', reason='needs launch_ros')
+
+from launch import LaunchContext
+from launch_ros.actions import Node
+
+FILE = Path(__file__).resolve().parents[2] / 'codetr_ros' / 'launch' / 'train.launch.py'
+
+
+@pytest.fixture
+def started(tmp_path):
+    """Package and executable of each node that the launch file starts under some settings."""
+    spec = spec_from_file_location('train_launch', FILE)
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+
+    def start(*lines):
+        config = tmp_path / 'config.yaml'
+        config.write_text('\n'.join(lines) + '\n')
+        context = LaunchContext()
+        for name, (default, _) in module.ARGUMENTS.items():
+            context.launch_configurations[name] = default
+        context.launch_configurations['config'] = str(config)
+        nodes = [made for made in module.nodes(context) if isinstance(made, Node)]
+        return [(node.node_package, node.node_executable) for node in nodes]
+
+    return start
+
+
+def test_all_nodes_of_a_run_are_started(started):
+    assert sorted(started('task: Pendulum-v1')) == [
+        ('codetr_ros', 'record'),
+        ('learner_node', 'learner'),
+        ('reward_node', 'reward'),
+        ('sim_node', 'evaluate'),
+        ('sim_node', 'sim'),
+    ]
+
+
+def test_nodes_that_a_run_does_not_need_are_not_started(started):
+    names = [executable for _, executable in started('method: hc', 'evaluate_every: 0')]
+    assert sorted(names) == ['learner', 'record', 'sim']
