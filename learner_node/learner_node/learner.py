@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from codetr_ros.ros.signals import Stop
 
 if TYPE_CHECKING:
-    from codetr_ros.ros.node import MakeCore
+    from codetr_ros.ros.joining import MakeCore
 
 
 def load() -> 'MakeCore':

@@ -3,15 +3,16 @@
 import sys
 
 from codetr_ros.records import Transitions
-from codetr_ros.ros.node import CoreNode, run_node
+from codetr_ros.ros.node import run_node
+from codetr_ros.ros.wiring import Wiring
 from reward_node.reward import load
 
 
-class Deaf(CoreNode):
-    def _take(self, record_type, message):
-        if record_type is not Transitions:
-            super()._take(record_type, message)
+class Deaf(Wiring):
+    def take(self, kind, message):
+        if kind is not Transitions:
+            super().take(kind, message)
 
 
 if __name__ == '__main__':
-    sys.exit(run_node('reward', 'reward', load, node_class=Deaf))
+    sys.exit(run_node('reward', 'reward', load, wire=Deaf))

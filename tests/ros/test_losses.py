@@ -13,7 +13,7 @@ from rosbags.highlevel import AnyReader
 from codetr_ros.records import Commit, CompositeReward, Presence, RecordError, Transitions
 from codetr_ros.ros import messages
 from codetr_ros.ros.fetch import unpack
-from codetr_ros.ros.node import CoreNode
+from codetr_ros.ros.membership import Membership
 from codetr_ros.ros.patience import Patience
 from codetr_ros.ros.peers import Peers
 from codetr_ros.ros.resend import LastPhases
@@ -116,11 +116,11 @@ class Core:
 def member(play):
     """A node with such a core."""
     play(roles=())
-    node = CoreNode('reward', 'reward', lambda: None, Stop())
-    node.link.advertise(['presence'])
-    node.core = Core()
-    yield node
-    node.link.close()
+    made = Membership('reward', 'reward', Stop())
+    made.link.advertise(['presence'])
+    made.serve(Core())
+    yield made
+    made.close()
 
 
 def test_diagnostics_tell_what_the_core_has_dropped_and_refused_later(member, play):
@@ -132,7 +132,7 @@ def test_diagnostics_tell_what_the_core_has_dropped_and_refused_later(member, pl
     member.refuse(Transitions, RecordError('wrong'))
 
     def said():
-        member._tell()
+        member.publish_presence()
         return [s for a in heard for s in a.status if s.name == f'{NAMESPACE}/reward: messages']
 
     status = witness.until(said)[0]
@@ -146,14 +146,14 @@ def test_diagnostics_tell_what_the_core_has_dropped_and_refused_later(member, pl
 def test_what_came_and_was_refused_is_not_lost(member):
     message = messages.to_message(transitions(), Time())
     message.actions = message.actions[:3]  # of another length than it says
-    member._take(Transitions, message)
+    member.take(Transitions, message)
     assert member.refused == {'transitions': 1}
     assert member.received == {'transitions': 1}
 
 
 def test_what_is_fetched_counts_as_recovered_only_if_it_was_new_and_taken(member):
     for record in (transitions(sequence=0), transitions(sequence=-1), transitions(sequence=4)):
-        member._receive_again(record)
+        member.receive_again(record)
     assert member.recovered == {'transitions': 1}
 
 

@@ -6,9 +6,11 @@ import os
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from rclpy.serialization import serialize_message
 
-from codetr_ros.ros.recording import RecordNode
+from codetr_ros.cores.recorder import Recorder
+from codetr_ros.ros.joining import Joined
+from codetr_ros.ros.membership import Membership
+from codetr_ros.ros.recording import Recording
 from codetr_ros.ros.signals import Stop
 from codetr_ros.runs import folder as run_folder
 from helpers.bag_writing import files, sequences
@@ -19,16 +21,17 @@ from helpers.playing import everybody_matched, output, process
 
 @pytest.fixture
 def recorder(play, tmp_path):
-    """A recorder node with its bag open, not joined to anything."""
+    """The wiring of a recorder with its bag open, among no peers."""
     play = play(roles=())
-    node = RecordNode('record', 'record', lambda: None, Stop())
-    node.values = {'bag': str(tmp_path / 'bag'), 'bag_split_mb': 0.0, 'bag_keep_free_mb': 0.0}
-    node.run_spec, node.settings = play.spec, play.settings
-    node.link.advertise(['run', 'commits'])
-    node._run_message = serialize_message(node.link.message(play.spec))
-    node.open_topics(play.settings)
-    yield node
-    node.link.close()
+    member = Membership('record', 'record', Stop())
+    member.values = {'bag': str(tmp_path / 'bag'), 'bag_split_mb': 0.0, 'bag_keep_free_mb': 0.0}
+    member.announcement = member.link.message(play.spec)
+    member.link.advertise(['run', 'commits'])
+    core = Recorder(play.spec, play.settings, 'record')
+    wiring = Recording(member, Joined(play.spec, play.settings, core, None))
+    wiring.open()
+    yield wiring
+    member.close()
 
 
 def test_a_commit_goes_out_when_it_and_all_before_it_are_on_the_disk(
@@ -36,7 +39,7 @@ def test_a_commit_goes_out_when_it_and_all_before_it_are_on_the_disk(
 ):
     path = tmp_path / 'bag' / 'bag_0.mcap'
     happened = []
-    fsync, send = os.fsync, recorder.link.send
+    fsync, send = os.fsync, recorder.member.link.send
 
     def watched_fsync(descriptor):
         fsync(descriptor)
@@ -47,11 +50,11 @@ def test_a_commit_goes_out_when_it_and_all_before_it_are_on_the_disk(
         send(topic, message)
 
     monkeypatch.setattr(os, 'fsync', watched_fsync)
-    monkeypatch.setattr(recorder.link, 'send', watched_send)
+    monkeypatch.setattr(recorder.member.link, 'send', watched_send)
     recorder.deliver(commit())
     size = path.stat().st_size
     assert happened == [('on the disk', size), ('commits', size)]
-    recorder.closing()
+    recorder.close()
     with path.open('rb') as file:
         topics = [channel.topic for _, channel, _ in make_reader(file).iter_messages()]
     assert topics == ['/r/run', '/r/commits']

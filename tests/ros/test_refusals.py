@@ -10,14 +10,18 @@ import yaml
 
 from codetr_ros.bags.errors import BagError
 from codetr_ros.config import IN_PROCESS_ONLY, SettingsError, load
+from codetr_ros.cores.core import Part
 from codetr_ros.learners.sac import SacError
 from codetr_ros.policy.acting import NetworkError
 from codetr_ros.processes import middleware
 from codetr_ros.records import RecordError
 from codetr_ros.rewards.base import RewardModelError
 from codetr_ros.ros import errors
-from codetr_ros.ros.node import CoreNode
+from codetr_ros.ros.joining import Joined
+from codetr_ros.ros.membership import Membership
+from codetr_ros.ros.node import Node
 from codetr_ros.ros.signals import Stop
+from codetr_ros.ros.wiring import Wiring
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.checkpoints import CheckpointError
 from codetr_ros.runs.reports import CoreReport
@@ -117,14 +121,14 @@ def test_any_other_error_is_told_with_its_kind():
     assert errors.in_words(ValueError('why')) == 'ValueError: why'
 
 
-class Core:
+class Core(Part):
     """A core whose second slice fails."""
 
     subscribes = ()
-    finished = False
     signal = None  # comes in the first slice
 
     def __init__(self, error, stop):
+        super().__init__()
         self.error = error
         self.stop = stop
         self.saved = False
@@ -141,16 +145,25 @@ class Core:
         return CoreReport()
 
 
-class Begun(CoreNode):
-    """A node among peers that are all there."""
+class Alone(Wiring):
+    """The wiring of a node that lacks nobody."""
 
-    def _join(self):
-        self.values = {'peer_deadline': 60.0}
-        self.link.advertise(['presence'])
-        return True
+    def lacking(self):
+        return []
 
-    def _gather(self):
-        return True
+
+def begun(play, stop, core):
+    """A node with this core, in a run that needs nobody else."""
+    play = play(roles=())
+    member = Membership('learner', 'learner', stop)
+
+    def join(member):
+        member.introduce()
+        member.run = play.spec
+        member.serve(core)
+        return Joined(play.spec, play.settings, core, None)
+
+    return Node(member, join, Alone)
 
 
 @pytest.mark.parametrize(
@@ -159,10 +172,9 @@ class Begun(CoreNode):
     ids=['ours', 'a fault'],
 )
 def test_an_error_amid_a_slice_ends_the_node_without_saving(play, capfd, error, traceback):
-    play(roles=())
-    node = Begun('learner', 'learner', lambda: None, Stop())
-    node.core = core = Core(error, node.stop)
-    assert node.run() == 1
+    stop = Stop()
+    core = Core(error, stop)
+    assert begun(play, stop, core).run() == 1
     said = capfd.readouterr().err
     assert str(error) in said
     assert ('Traceback' in said) == traceback
@@ -170,26 +182,25 @@ def test_an_error_amid_a_slice_ends_the_node_without_saving(play, capfd, error, 
 
 
 def test_a_node_that_is_stopped_between_two_slices_saves(play):
-    play(roles=())
-    node = Begun('learner', 'learner', lambda: None, Stop())
-    node.core = core = Core(SacError('not reached'), node.stop)
+    stop = Stop()
+    core = Core(SacError('not reached'), stop)
     core.signal = signal.SIGTERM
-    assert node.run() == 0
+    assert begun(play, stop, core).run() == 0
     assert core.saved
 
 
 SHOW = """
 import os
 from codetr_ros.processes import middleware
-from codetr_ros.ros.node import CoreNode, run_node
+from codetr_ros.ros.node import Node, run_node
 
-class Node(CoreNode):
-    def run(self):
-        print(*(os.environ[name] for name in middleware.DEFAULTS))
-        self.link.close()
-        return 0
+def show(node):
+    print(*(os.environ[name] for name in middleware.DEFAULTS))
+    node.member.close()
+    return 0
 
-run_node('record', 'record', None, [], node_class=Node)
+Node.run = show
+run_node('record', 'record', None, [])
 """
 
 

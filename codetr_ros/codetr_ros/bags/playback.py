@@ -180,6 +180,7 @@ class Playback:
     """
 
     subscribes: tuple[type, ...] = (Metrics,)
+    missing = None  # it takes no phases in
 
     def __init__(
         self,
@@ -198,6 +199,8 @@ class Playback:
         self._waiting = ''
         self.phase = -1  # the last whose commit was given out
         self.counters: Counter[str] = Counter()
+        self.duplicated: Counter[str] = Counter()
+        self.refused: Counter[str] = Counter()
         self.finished = False
 
     def receive(self, record: Record) -> None:

@@ -9,6 +9,7 @@ from codetr_msgs.srv import FetchPhase
 from rclpy.serialization import deserialize_message
 
 from codetr_ros.records import Record, RecordError
+from codetr_ros.records.fields import RECORD_TYPES
 from codetr_ros.ros import messages
 from codetr_ros.ros.link import Link
 
@@ -34,9 +35,9 @@ def unpack(response: Any) -> list[Record]:
     found = []
     ends = np.cumsum(lengths, dtype=np.int64)
     for kind, length, end in zip(response.types, lengths, ends.tolist(), strict=True):
-        if kind not in messages.RECORD_TYPES:
+        if kind not in RECORD_TYPES:
             raise RecordError(f'{SERVICE}: {kind!r} is not a type of record: update the recorder')
-        message_type = messages.message_type(messages.RECORD_TYPES[kind])
+        message_type = messages.message_type(RECORD_TYPES[kind])
         found.append(
             messages.from_message(deserialize_message(data[end - length : end], message_type))
         )

@@ -104,7 +104,7 @@ class Link:
         self.published[topic] += 1
 
     def diagnose(self, level: bytes, message: str, counters: dict[str, dict[str, int]]) -> None:
-        """Say on /diagnostics how messages fare."""
+        """Publish on /diagnostics how messages fare."""
         values = [
             KeyValue(key=f'{kind} {topic}', value=str(n))
             for kind, by_topic in counters.items()
@@ -135,6 +135,16 @@ class Link:
             self._executor.spin_once(timeout_sec=0)
             if self._events == seen:
                 return
+
+    def handle(self, wait: float = 0.0) -> None:
+        """Handle everything that has arrived, in the main loop.
+
+        Args:
+            wait: seconds to block for something to arrive, if nothing has.
+        """
+        self.drain(wait)
+        while self.inbox:
+            self.inbox.popleft()()
 
     def unmatched(
         self, topics: Iterable[str], names: Callable[[str], set[str]], readers: bool

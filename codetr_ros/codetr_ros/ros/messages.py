@@ -112,9 +112,10 @@ def to_message(record: Record, stamp: Time) -> Any:
     Raises:
         RecordError: a number does not fit its field.
     """
-    message = message_type(type(record))()
+    kind: type = type(record)
+    message = message_type(kind)()
     message.stamp = stamp
-    for field in _fields(type(record)):
+    for field in _fields(kind):
         try:
             setattr(message, field.name, field.outward(getattr(record, field.name)))
         except (ValueError, TypeError, OverflowError) as error:

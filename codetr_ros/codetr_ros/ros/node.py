@@ -23,171 +23,185 @@ import rclpy
 from rclpy.signals import SignalHandlerOptions
 
 from codetr_ros.processes import middleware
-from codetr_ros.records import TOPICS, Record
-from codetr_ros.ros import errors, signals
-from codetr_ros.ros.joining import IDLE, Joining
-from codetr_ros.ros.member import MakeCore
+from codetr_ros.records import TOPICS
+from codetr_ros.ros import errors, joining, signals
+from codetr_ros.ros.gathering import IDLE, wait_for
+from codetr_ros.ros.joining import Joined, LoadCore
+from codetr_ros.ros.membership import Membership
 from codetr_ros.ros.patience import Patience
 from codetr_ros.ros.signals import Stop
+from codetr_ros.ros.wiring import Wire, Wiring
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import reports
-from codetr_ros.runs.reports import BagReport, CoreReport
+from codetr_ros.runs.reports import CoreReport
 
 ACK_DEADLINE = 5.0  # [s] at the end for readers that have not everything yet
 STOPPED_DEADLINE = 0.1  # [s] the same when the process was asked to stop
-SHUTDOWN_DEADLINE = 8  # [s] for the middleware to let go, once everything is saved and said:
+SHUTDOWN_DEADLINE = 8  # [s] for the middleware to let go, once everything is saved and published:
 # well before `launcher.STOP_DEADLINE`, which counts from the signal on
-LAST_WORDS = 5  # times that the last presence is said: so many make the middleware ask for answers
+LAST_PRESENCES = 5  # enough for the middleware to request acknowledgements
 
 
-class CoreNode(Joining):
-    """A core, wired to ROS."""
+class Node:
+    """The main loop of a node.
+
+    Args:
+        member: its membership.
+        join: makes it part of a run; None if asked to stop meanwhile.
+        wire: wires the core, once it has joined.
+    """
+
+    def __init__(
+        self, member: Membership, join: Callable[[Membership], Joined | None], wire: Wire
+    ) -> None:
+        self.member = member
+        self._join = join
+        self._wire = wire
+        self._log = member.log
+        self._sound = True  # the core is between two slices, fit to be saved
+        self._started = time.monotonic()
 
     def run(self) -> int:
-        """Everything, from the parameters to the last word; returns the exit code of the
+        """Everything, from the parameters to the last message; returns the exit code of the
         process.
         """
         error: str | None = None
+        wiring: Wiring | None = None
         try:
-            if self._join() and self._gather():
-                self._work()
-        except Exception as problem:  # noqa: BLE001 - the report and the last word must go out
+            joined = self._join(self.member)
+            if joined is not None:
+                wiring = self._wire(self.member, joined)
+                wiring.enter()
+                if self._gather(wiring):
+                    self._work(wiring)
+        except Exception as problem:  # noqa: BLE001 - report and last presence must go out
             self._sound = self._sound and errors.explains_itself(problem)
             error = errors.in_words(problem)
-            self._say_fatal(problem)
-        return self._end(error)
+            self._log_fatal(problem)
+        return self._end(wiring, error)
 
-    def _say_fatal(self, problem: Exception, when: str = '') -> None:
-        """Say an error: in its own words, or where it happened if it has none."""
+    def _log_fatal(self, problem: Exception, when: str = '') -> None:
+        """Log an error: in its own words, or where it happened if it has none."""
         own = errors.explains_itself(problem)
-        self.log.fatal(f'{when}{problem if own else traceback.format_exc()}')
+        self._log.fatal(f'{when}{problem if own else traceback.format_exc()}')
 
-    def _work(self) -> None:
-        assert self.core is not None
-        work = self.core.work()
-        topics = [TOPICS[kind] for kind in self.core.subscribes]
+    def _gather(self, wiring: Wiring) -> bool:
+        """Wait until everybody is there and matched. False if asked to stop meanwhile."""
+        if not (wiring.complete() and wait_for(self.member, wiring.lacking)):
+            return False
+        self.member.begun = True
+        self._log.info('everybody is there')
+        return True
+
+    def _work(self, wiring: Wiring) -> None:
+        member, core = self.member, wiring.joined.core
+        work = core.work()
         patience = Patience(
-            self.link.full_name,
-            self.role,
-            topics,
-            self.peers,
-            self.values['peer_deadline'],
-            self.log,
+            member.link.full_name,
+            member.role,
+            [TOPICS[kind] for kind in core.subscribes],
+            member.peers,
+            member.deadline,
+            self._log,
         )
         waiting: float | None = None  # since when
-        while not self.stop:
-            self._turn()
+        while not member.stop:
+            member.turn()
             self._sound = False  # until the slice has ended well
-            records = next(work)
-            for record in records or ():
-                self.deliver(record)
+            given = next(work)
+            for each in given or ():
+                wiring.deliver(each)
             self._sound = True
-            if records is not None:
+            if given is not None:
                 waiting = None
-                self._doing = 'works'
+                member.doing = 'works'
                 continue
             now = time.monotonic()
             waiting = now if waiting is None else waiting
-            if self.core.finished:
-                self._doing = 'has finished'
-                if self.settled(now - waiting):
+            if core.finished:
+                member.doing = 'has finished'
+                if wiring.settled(now - waiting):
                     return
             else:
-                self._doing = self._waits()
-                patience.check(now, now - waiting, self._doing, self.lost())
-            self._turn(IDLE)
+                member.doing = wiring.waits()
+                patience.check(now, now - waiting, member.doing, member.lost())
+            member.turn(IDLE)
 
-    def _waits(self) -> str:
-        say = getattr(self.core, 'waiting_for', None)
-        return f'waits for {say()}' if say else 'waits for messages'
-
-    def deliver(self, record: Record) -> None:
-        """Pass on a record that the core yielded."""
-        self.link.publish(record)
-
-    def settled(self, seconds: float) -> bool:
-        """Whether a node whose core has finished `seconds` ago may end."""
-        return True
-
-    def closing(self) -> None:
-        """Finish what the node itself holds open, once nothing more will arrive."""
-
-    def own_report(self) -> BagReport | None:
-        """What the node adds to the core's report."""
-        return None
-
-    def _end(self, error: str | None) -> int:
-        """Save, report, say goodbye; returns the exit code."""
-        finished = bool(self.core and self.core.finished and error is None)
+    def _end(self, wiring: Wiring | None, error: str | None) -> int:
+        """Save, report, take leave; returns the exit code."""
+        stop = self.member.stop
+        finished = wiring is not None and wiring.joined.core.finished and error is None
         steps: list[Callable[[], None]] = [
-            self.closing,
-            lambda: self._report(finished, error),
-            self._goodbye,
+            lambda: self._report(wiring, finished, error),
+            self._take_leave,
         ]
-        if self.core is not None and self._sound:  # half a slice is not fit to be saved
-            steps.insert(0, self.core.close)
+        if wiring is not None:
+            steps.insert(0, wiring.close)
+            if self._sound:  # half a slice is not fit to be saved
+                steps.insert(0, wiring.joined.core.close)
         for step in steps:
             try:
                 step()
             except Exception as problem:  # noqa: BLE001 - one failure must not stop the rest
                 error = error or errors.in_words(problem)
-                self._say_fatal(problem, 'at the end: ')
-        if self.stop.signal and not error and not finished:
-            self.log.info(f'stopped by {self.stop.signal.name}')
+                self._log_fatal(problem, 'at the end: ')
+        if stop.signal and not error and not finished:
+            self._log.info(f'stopped by {stop.signal.name}')
         code = 1 if error else 0
         try:
-            self.stop.end_within(SHUTDOWN_DEADLINE, code)
+            stop.end_within(SHUTDOWN_DEADLINE, code)
         except OSError as problem:
-            self.log.warning(f'nothing will end this process if its middleware hangs: {problem}')
-        self.let_go()
+            self._log.warning(f'nothing will end this process if its middleware hangs: {problem}')
+        self.member.close()
         return code
 
-    def let_go(self) -> None:
-        """Take everything that is the node's off the graph: last of all."""
-        self.link.close()
-
-    def _report(self, finished: bool, error: str | None) -> None:
-        if self.folder is None:
+    def _report(self, wiring: Wiring | None, finished: bool, error: str | None) -> None:
+        member = self.member
+        if member.folder is None:
             return
         used = resource.getrusage(resource.RUSAGE_SELF)
+        core_report = wiring.joined.core.report() if wiring else CoreReport()
         report = reports.node_report(
-            self.core.report() if self.core else CoreReport(),
-            role=self.role,
-            name=self.link.name,
-            published={t: n for t, n in self.link.published.items() if t != 'presence'},
-            received=self.received,
-            refused=self.refused,
-            lost=self.lost(),
-            fetched=self.recovered,
+            core_report,
+            role=member.role,
+            name=member.link.name,
+            published={t: n for t, n in member.link.published.items() if t != 'presence'},
+            received=member.received,
+            refused=member.refused,
+            lost=member.lost(),
+            fetched=member.recovered,
             cpu_s=used.ru_utime + used.ru_stime,
             wall_s=time.monotonic() - self._started,
             finished=finished,
             error=error,
-            own=self.own_report(),
+            own=wiring.report() if wiring else None,
         )
-        reports.write(run_folder.report_path(self.folder, self.role, self.link.name), report)
+        path = run_folder.report_path(member.folder, member.role, member.link.name)
+        reports.write(path, report)
 
-    def _goodbye(self) -> None:
-        """Say the last word, and stay until the readers have everything or have finished too.
+    def _take_leave(self) -> None:
+        """Publish the last presence, and stay until the readers have everything or have finished
+        too.
 
         A reader that lacks something is served again by this process only. The middleware asks
         whether it does with every few messages, else only every 3 s: waiting for its answer alone
         would make every run 3 s longer, and every stop.
         """
-        if not self.values:
+        member, link = self.member, self.member.link
+        for other in member.company:
+            other.publish_presence(finished=True)
+        if not member.values:
             return
-        for _ in range(LAST_WORDS):
-            self._tell(finished=True)
-        end = time.monotonic() + (STOPPED_DEADLINE if self.stop else ACK_DEADLINE)
-        while time.monotonic() < end and self.peers.anybody_left():
-            if not self.link.unacknowledged():
+        for _ in range(LAST_PRESENCES):
+            member.publish_presence(finished=True)
+        end = time.monotonic() + (STOPPED_DEADLINE if member.stop else ACK_DEADLINE)
+        while time.monotonic() < end and member.peers.anybody_left():
+            if not link.unacknowledged():
                 return
-            self.link.drain(IDLE)
-            while self.link.inbox:
-                self.link.inbox.popleft()()
-        late = self.link.unacknowledged()
-        if late and self.peers.anybody_left() and not self.stop:
-            self.log.warning(f'not everybody has received everything on {", ".join(late)}')
+            link.handle(IDLE)
+        late = link.unacknowledged()
+        if late and member.peers.anybody_left() and not member.stop:
+            self._log.warning(f'not everybody has received everything on {", ".join(late)}')
 
 
 class _ToRos(logging.Handler):
@@ -210,10 +224,10 @@ class _ToRos(logging.Handler):
 def run_node(
     role: str,
     name: str,
-    load_core: Callable[[], MakeCore],
+    load_core: LoadCore,
     argv: Iterable[str] | None = None,
     stop: Stop | None = None,
-    node_class: type[CoreNode] = CoreNode,
+    wire: Wire = Wiring,
 ) -> int:
     """The main function of a node.
 
@@ -223,7 +237,7 @@ def run_node(
         load_core: imports what is slow to import and returns what makes the core.
         argv: command line without the program; that of the process where None.
         stop: signals taken earlier; taken here where None.
-        node_class: another wiring (the recorder's).
+        wire: another wiring (the recorder's).
 
     Returns:
         Exit code: 0 also when stopped by SIGINT or SIGTERM, 1 after an error.
@@ -232,11 +246,12 @@ def run_node(
     for variable, value in middleware.DEFAULTS.items():
         os.environ.setdefault(variable, value)
     arguments = None if argv is None else [name, *argv]
+    announce = joining.own_run if role == 'learner' else None
     rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     try:
-        node = node_class(role, name, load_core, stop)
-        logging.getLogger('codetr_ros').addHandler(_ToRos(node.log))
-        return node.run()
+        member = Membership(role, name, stop)
+        logging.getLogger('codetr_ros').addHandler(_ToRos(member.log))
+        return Node(member, lambda it: joining.join(it, load_core, announce), wire).run()
     finally:
         rclpy.try_shutdown()
         signals.ignore()

@@ -39,6 +39,7 @@ class Own:
     description: str
     low: float = 0.0
     high: float = 86_400.0
+    of_core: bool = False  # the node's core is made with it
 
     def descriptor(self) -> ParameterDescriptor:
         """What `ros2 param describe` shows."""
@@ -75,10 +76,12 @@ OWN_OF_ROLE: dict[str, dict[str, Own]] = {
             '',
             'reward model to start from: the folder of a checkpoint, of a fit or of a run; empty: '
             'a new one. It must be of the same method, sizes and settings that shape it',
+            of_core=True,
         ),
         'frozen': Own(
             False,
             'label as the checkpoint does, without learning; else the model goes on learning',
+            of_core=True,
         ),
     },
     'record': {
@@ -102,13 +105,14 @@ OWN_OF_ROLE: dict[str, dict[str, Own]] = {
 }
 
 
-CORE_OF_ROLE: dict[str, tuple[str, ...]] = {'reward': ('checkpoint', 'frozen')}
-"""Own parameters that the core of a role is made with."""
-
-
 def own_parameters(role: str) -> dict[str, Own]:
     """The parameters that a node of this role has besides the settings."""
     return OWN | OWN_OF_ROLE.get(role, {})
+
+
+def core_parameters(role: str) -> tuple[str, ...]:
+    """Those of them that the core of this role is made with."""
+    return tuple(name for name, own in own_parameters(role).items() if own.of_core)
 
 
 def _settings_fields(model: type[BaseModel], prefix: str = '') -> dict[str, Any]:

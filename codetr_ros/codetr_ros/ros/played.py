@@ -1,39 +1,20 @@
 """Roles of a recorded run that are there because live nodes wait for them."""
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection
+from typing import Any
 
 from rclpy.logging import LoggingSeverity
 
 from codetr_ros.bags.playback import Recorded
 from codetr_ros.config import Settings
-from codetr_ros.records import TOPICS, Record
+from codetr_ros.cores.core import Silent
+from codetr_ros.records import TOPICS
 from codetr_ros.records.roles import WRITERS, readers
-from codetr_ros.ros.joining import Joining
-from codetr_ros.ros.link import RECORDS_OF_TOPIC
-from codetr_ros.ros.signals import Stop
-from codetr_ros.runs.reports import CoreReport
-
-
-class _Silent:
-    """The core of a role that is only played: nothing of its own to say."""
-
-    subscribes: tuple[type, ...] = ()
-    finished = True
-
-    def receive(self, record: Record) -> None:
-        """Nothing is subscribed to."""
-
-    def work(self) -> Iterator[list[Record] | None]:
-        """Nothing to do."""
-        while True:
-            yield None
-
-    def close(self) -> None:
-        """Nothing to save."""
-
-    def report(self) -> CoreReport:
-        """Nothing to report."""
-        return CoreReport()
+from codetr_ros.ros.gathering import absent_or_unmatched
+from codetr_ros.ros.joining import Joined, join
+from codetr_ros.ros.link import RECORDS_OF_TOPIC, Link
+from codetr_ros.ros.membership import Membership
+from codetr_ros.ros.wiring import Wiring
 
 
 def _must_read(role: str, settings: Settings, live: Collection[str]) -> list[type]:
@@ -45,57 +26,87 @@ def _must_read(role: str, settings: Settings, live: Collection[str]) -> list[typ
     ]
 
 
-class Played(Joining):
-    """A node whose peers matter only where they are live."""
+class PlayedWiring(Wiring):
+    """The wiring of a role that is played: its peers matter only where they are live.
 
-    _live: Collection[str]
+    Args:
+        member: the played node's membership.
+        joined: what it has joined.
+        live: roles whose nodes are there themselves.
+    """
 
-    def _names(self, table: dict[str, tuple[str, ...]]) -> Callable[[str], set[str]]:
-        live = {
-            topic: tuple(r for r in roles if r in self._live) for topic, roles in table.items()
-        }
-        return super()._names(live)
+    def __init__(self, member: Membership, joined: Joined, live: Collection[str]) -> None:
+        super().__init__(member, joined)
+        self._live = live
 
-    def open_topics(self, settings: Settings) -> None:
+    def open(self) -> None:
         """Subscribe to what the core wants; read the rest that live nodes want to be read without
         looking at it.
         """
-        super().open_topics(settings)
-        assert self.core is not None
-        for kind in _must_read(self.role, settings, self._live):
-            if kind not in self.core.subscribes:
-                self.link.subscribe(kind, self._pass, settings, raw=True)
+        super().open()
+        settings = self.joined.settings
+        for kind in _must_read(self.member.role, settings, self._live):
+            if kind not in self.joined.core.subscribes:
+                self.member.link.subscribe(kind, self._pass, settings, raw=True)
 
     def _pass(self, kind: type, raw: bytes) -> None:
-        self.received[TOPICS[kind]] += 1
-
-
-class PlayedRole(Played):
-    """A role that is there because nodes wait for it. What it publishes, the player sends."""
-
-    def __init__(
-        self, role: str, name: str, recorded: Recorded, live: Collection[str], stop: Stop
-    ) -> None:
-        super().__init__(role, name, lambda: lambda *_, **__: _Silent(), stop)
-        self.log.set_level(LoggingSeverity.WARN)  # the player says the rest once
-        self._recorded = recorded
-        self._live = live
-
-    def _make_run(self) -> None:
-        self.run_spec, self.settings = self._recorded.run, self._recorded.settings
-
-    def join(self) -> bool:
-        """Become part of the run; false if asked to stop meanwhile."""
-        return self._join()
-
-    def turn(self) -> None:
-        """Let ROS have its turn."""
-        self._turn()
+        self.member.received[TOPICS[kind]] += 1
 
     def lacking(self) -> list[str]:
-        """Who is not there yet."""
-        return self._lacking()
+        """Who is not there yet, or not matched."""
+        run, settings = self.joined.run, self.joined.settings
+        return absent_or_unmatched(self.member, settings, run.settings_hash, self._live)
 
-    def leave(self) -> None:
-        """Say the last word."""
-        self._tell(finished=True)
+
+class Cast:
+    """All roles that are played beside the recorder. What they publish, the player sends.
+
+    Args:
+        recorder: the played recorder, whose company they are.
+        recorded: the run.
+        live: roles whose nodes are there themselves, and that nobody plays.
+    """
+
+    def __init__(self, recorder: Membership, recorded: Recorded, live: Collection[str]) -> None:
+        self._recorder = recorder
+        self._recorded = recorded
+        self._live = live
+        self._wirings: list[PlayedWiring] = []
+        self._links: dict[tuple[str, str], Link] = {('record', ''): recorder.link}
+
+    def play(self, role: str, name: str) -> bool:
+        """Have a node of this role and name join the run, unless the role is live; false if asked
+        to stop meanwhile.
+        """
+        if role in self._live:
+            return True
+        member = Membership(role, name, self._recorder.stop)
+        member.log.set_level(LoggingSeverity.WARN)  # the player logs the rest once
+        self._links[role, name if role == 'sim' else ''] = member.link
+        self._recorder.company.append(member)
+        recorded = self._recorded
+        announce = (lambda _: (recorded.run, recorded.settings)) if role == 'learner' else None
+        joined = join(member, lambda: _silent, announce)
+        if joined is None:
+            return False
+        wiring = PlayedWiring(member, joined, self._live)
+        wiring.enter()
+        self._wirings.append(wiring)
+        return True
+
+    def link(self, role: str, name: str) -> Link | None:
+        """What publishes for a played node; None if it is live.
+
+        Args:
+            role: its role.
+            name: its name where it is a simulator, else empty.
+        """
+        return self._links.get((role, name))
+
+    def lacking(self) -> list[str]:
+        """Who is not there yet, or not matched with somebody who is played."""
+        return [text for wiring in self._wirings for text in wiring.lacking()]
+
+
+def _silent(*_: Any, **__: Any) -> Silent:
+    return Silent()

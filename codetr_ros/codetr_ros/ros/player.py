@@ -13,7 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import rclpy
 from rclpy.serialization import serialize_message
@@ -25,155 +25,140 @@ from codetr_ros.records import TOPICS, Commit, EpisodeResult, Metrics, RunSpec
 from codetr_ros.records.roles import WRITERS
 from codetr_ros.ros import signals
 from codetr_ros.ros.errors import NodeError
-from codetr_ros.ros.link import Link
-from codetr_ros.ros.member import MakeCore
-from codetr_ros.ros.node import CoreNode
+from codetr_ros.ros.joining import Joined, join
+from codetr_ros.ros.membership import Membership
+from codetr_ros.ros.node import Node
 from codetr_ros.ros.peers import Peer
-from codetr_ros.ros.played import Played, PlayedRole
+from codetr_ros.ros.played import Cast, PlayedWiring
 from codetr_ros.ros.resend import Resender
 from codetr_ros.ros.signals import Stop
 
 LEARNERS = ('reward', 'learner')
 """Roles that learn from what is played, and that it waits for."""
-SAY_EVERY = 5.0  # [s] between two words on how far it is
+LOG_EVERY = 5.0  # [s] between two lines on how far it is
 MUST_AGREE = ('task', 'composite', 'beta', 'delay', 'phase_steps', 'simulators', 'envs')
 """Settings under which the steps were made: a live learner must have the same."""
 
 
-class PlayNode(Played, CoreNode):
-    """The played recorder, and with it everybody else who is played.
+def check_settings(recorded: Recorded, settings: Settings) -> None:
+    """Refuse a live learner whose run the recorded steps cannot be part of.
 
     Args:
-        recorded: the run.
-        found: makes an iterator over its messages.
+        recorded: the recorded run.
+        settings: of the learner's run.
+
+    Raises:
+        NodeError: names the setting and both values.
+    """
+    theirs, ours = settings.flat(), recorded.settings.flat()
+    for name in MUST_AGREE:
+        if ours[name] != theirs[name]:
+            raise NodeError(
+                f'the recorded run has {name} = {ours[name]!r}, the learner {theirs[name]!r}: '
+                f'start the learner with {name}:={ours[name]}'
+            )
+    last = settings.phases - 1
+    longer = settings.phases > recorded.phases
+    if longer or settings.steps_of(last) != recorded.settings.steps_of(last):
+        steps = recorded.settings.steps
+        raise NodeError(
+            f'the learner has steps = {settings.steps}, but {steps} were recorded in phases of '
+            f'{recorded.settings.phase_steps}: start it with steps:={steps}'
+        )
+
+
+class Playing(PlayedWiring):
+    """The wiring of the played recorder, and with it of everybody else who is played.
+
+    Args:
+        member: the played recorder's membership.
+        joined: what it has joined.
+        recorded: the run that is played.
         live: roles whose nodes are there themselves.
-        pace: when messages are due at the earliest; None: at once.
-        stop: true once the process is asked to stop.
+        cast: everybody else who is played.
     """
 
     def __init__(
         self,
+        member: Membership,
+        joined: Joined,
         recorded: Recorded,
-        found: Callable[[], Iterator[Item]],
         live: Collection[str],
-        pace: Pace | None,
-        stop: Stop,
+        others: Cast,
     ) -> None:
-        super().__init__('record', 'record', self._load, stop)
-        self._recorded = recorded.cut() if live else recorded
-        self._found = found
-        self._live = live
-        self._pace = pace
-        self._others: list[PlayedRole] = []
-        self._links: dict[tuple[str, str], Link] = {('record', ''): self.link}
-        self._said_at = 0.0
+        super().__init__(member, joined, live)
+        self._recorded = recorded
+        self._cast = others
+        self._playback = cast(Playback, joined.core)  # as `Player` made it
+        self._logged_at = 0.0
         self._done = False
         self.played: Counter[str] = Counter()
         self.left = 0  # messages of roles that are live
 
-    def _load(self) -> MakeCore:
-        def make(_: RunSpec, settings: Settings, *_more: object) -> Playback:
-            learners = [role for role in LEARNERS if role in self._live]
-            phases = settings.phases if self._live else self._recorded.phases
-            return Playback(self._found(), phases, settings.lag, learners, self._pace)
-
-        return make
+    def open(self) -> None:
+        """Receive who has handled what, and offer to send a phase again."""
+        super().open()
+        settings = self.joined.settings
+        self._last = Resender(self.member.link, self.joined.run.run_id, settings.lag + 2)
 
     # ---- joining
 
-    def _join(self) -> bool:
-        if 'learner' not in self._live and not self._play('learner', 'learner'):
-            return False
-        if not super()._join():
-            return False
-        assert self.settings is not None
-        self._check_settings(self.settings)
-        if unknown := [role for role in self._live if role not in self.settings.roles]:
+    def complete(self) -> bool:
+        """Have everybody who is played join, if it is a run that can be played to.
+
+        Raises:
+            NodeError: the live nodes' run is another one, or has no such nodes.
+        """
+        settings = self.joined.settings
+        check_settings(self._recorded, settings)
+        self._check_labels(settings)
+        if unknown := [role for role in self._live if role not in settings.roles]:
             raise NodeError(
                 f'the run has no node of role {", ".join(unknown)} (method '
-                f'{self.settings.method!r}): there is nobody to play to'
+                f'{settings.method!r}): there is nobody to play to'
             )
         simulators = dict.fromkeys(map(self._simulator_of, self._recorded.sources))
         wanted = [('sim', name) for name in simulators]
-        wanted += [(role, role) for role in ('reward', 'evaluate') if role in self.settings.roles]
-        return all(self._play(role, name) for role, name in wanted if role not in self._live)
+        wanted += [(role, role) for role in ('reward', 'evaluate') if role in settings.roles]
+        return all(self._cast.play(role, name) for role, name in wanted)
 
-    def _play(self, role: str, name: str) -> bool:
-        other = PlayedRole(role, name, self._recorded, self._live, self.stop)
-        self._links[role, name if role == 'sim' else ''] = other.link
-        self._others.append(other)
-        return other.join()
-
-    def _check_settings(self, settings: Settings) -> None:
-        """Refuse a live learner whose run the recorded steps cannot be part of.
-
-        Raises:
-            NodeError: names the setting and both values.
-        """
+    def _check_labels(self, settings: Settings) -> None:
         recorded = self._recorded.settings
-        for name in MUST_AGREE:
-            ours, theirs = recorded.flat()[name], settings.flat()[name]
-            if ours != theirs:
-                raise NodeError(
-                    f'the recorded run has {name} = {ours!r}, the learner {theirs!r}: start the '
-                    f'learner with {name}:={ours}'
-                )
-        last = settings.phases - 1
-        if settings.phases > self._recorded.phases or settings.steps_of(last) != recorded.steps_of(
-            last
-        ):
-            raise NodeError(
-                f'the learner has steps = {settings.steps}, but {recorded.steps} were recorded in '
-                f'phases of {recorded.phase_steps}: start it with steps:={recorded.steps}'
-            )
-        if 'reward' not in self._live and settings.labels_steps:
-            self._check_labels(recorded)
-
-    def _check_labels(self, recorded: Settings) -> None:
-        if 'learner' in self._live and recorded.record_relabels == 'first':
+        played = 'reward' not in self._live and settings.labels_steps
+        if played and 'learner' in self._live and recorded.record_relabels == 'first':
             self.log.warning(
                 'the bag has the first labels of each segment only (record_relabels = first): the '
                 'learner does not learn what it learnt in the run. Play to a reward node too, or '
                 'record with record_relabels:=all'
             )
 
-    def open_topics(self, settings: Settings) -> None:
-        """Hear who has handled what, and offer to send a phase again."""
-        super().open_topics(settings)
-        assert self.run_spec is not None
-        self._last = Resender(self.link, self.run_spec.run_id, settings.lag + 2)
-
-    def _lacking(self) -> list[str]:
-        return super()._lacking() or [text for other in self._others for text in other.lacking()]
-
-    def _turn(self, wait: float = 0.0) -> None:
-        super()._turn(wait)
-        for other in self._others:
-            other.turn()
+    def lacking(self) -> list[str]:
+        """Who is not there yet, or not matched with somebody who is played."""
+        return super().lacking() or self._cast.lacking()
 
     # ---- playing
 
-    def deliver(self, item: Any) -> None:
+    def deliver(self, given: Item) -> None:
         """Publish a message as the node that published it in the run, unless that is live."""
-        link = self._links.get(self._publisher(item.record))
+        record: Any = given.record
+        link = self._cast.link(*self._publisher(record))
         if link is None:
             self.left += 1
             return
-        assert self.run_spec is not None
-        topic, data = TOPICS[type(item.record)], item.data
-        record = item.record
-        if record.run_id != self.run_spec.run_id:
-            record = replace(record, run_id=self.run_spec.run_id)
+        topic, data = TOPICS[type(record)], given.data
+        if record.run_id != self.joined.run.run_id:
+            record = replace(record, run_id=self.joined.run.run_id)
             data = serialize_message(link.message(record))
         if isinstance(record, Commit):
             self._last.commit(record, data)
-            self._say(record)
+            self._log_phase(record)
         else:
             self._last.hold(record, data)
         link.send(topic, data)
         self.played[topic] += 1
 
     def _publisher(self, record: Any) -> tuple[str, str]:
+        """Role of the node that published a record, and its name where it is a simulator."""
         if isinstance(record, Metrics):
             return record.role, record.node if record.role == 'sim' else ''
         if isinstance(record, EpisodeResult) and record.purpose != 'training':
@@ -187,25 +172,24 @@ class PlayNode(Played, CoreNode):
     def _simulator_of(self, source: str) -> str:
         return self._recorded.settings.simulator_of(source)
 
-    def _say(self, commit: Commit) -> None:
+    def _log_phase(self, commit: Commit) -> None:
         now = time.monotonic()
-        if now - self._said_at > SAY_EVERY:
-            self._said_at = now
+        if now - self._logged_at > LOG_EVERY:
+            self._logged_at = now
             self.log.info(f'phase {commit.phase} is played')
 
     def _audience(self) -> list[Peer]:
-        return [peer for role in self._live for peer in self.peers.alive(role)]
+        return [peer for role in self._live for peer in self.member.peers.alive(role)]
 
-    def _waits(self) -> str:
+    def waits(self) -> str:
         """What is waited for.
 
         Raises:
             NodeError: a live node has stopped.
         """
-        doing = super()._waits()
-        assert isinstance(self.core, Playback)
+        doing = super().waits()
         for peer in self._audience():
-            if peer.said.finished and not self.core.done(peer.said.role):
+            if peer.said.finished and not self._playback.done(peer.said.role):
                 raise NodeError(
                     f'{peer.said.role} {peer.said.node} stopped before everything was played: it '
                     f'{doing}. Look at its log, and play again'
@@ -223,7 +207,7 @@ class PlayNode(Played, CoreNode):
             learnt = ' and learnt from' if self._live else ''
             self.log.info(f'everything is played{learnt}')
         left = [peer for peer in self._audience() if not peer.said.finished]
-        deadline = self.values['peer_deadline']
+        deadline = self.member.deadline
         for peer in left:
             silent = time.monotonic() - peer.heard
             if deadline and silent > deadline:
@@ -231,14 +215,13 @@ class PlayNode(Played, CoreNode):
                     f'everything is played, but {peer.said.role} {peer.said.node} has been silent '
                     f'for {silent:.0f} s (--deadline {deadline:g}): look at its log'
                 )
-        self._doing = f'waits for the end of {", ".join(peer.said.node for peer in left)}'
+        names = ', '.join(peer.said.node for peer in left)
+        self.member.doing = f'waits for the end of {names}'
         return not left
 
-    def say_what_was_played(self) -> None:
-        """Print the counts."""
-        if not isinstance(self.core, Playback):
-            return
-        report = self.core.report()
+    def print_counts(self) -> None:
+        """Print what was played."""
+        report = self._playback.report()
         counts = ', '.join(f'{n} {what}' for what, n in sorted(report.counters.items()))
         print(f'played {report.phases} of {self._recorded.phases} phases: {counts}')
         print(
@@ -250,21 +233,59 @@ class PlayNode(Played, CoreNode):
             )
         sys.stdout.flush()  # nobody else does if the middleware hangs now
 
-    def _goodbye(self) -> None:
-        for other in self._others:
-            other.leave()
-        super()._goodbye()
 
-    def let_go(self) -> None:
-        """Take everybody who is played off the graph."""
-        for other in self._others:
-            other.link.close()
-        super().let_go()
+class Player:
+    """The node that plays a run: the recorder's, with everybody else who is played.
+
+    Args:
+        recorded: the run.
+        items: makes an iterator over its messages.
+        live: roles whose nodes are there themselves.
+        pace: when messages are due at the earliest; None: at once.
+        stop: true once the process is asked to stop.
+    """
+
+    def __init__(
+        self,
+        recorded: Recorded,
+        items: Callable[[], Iterator[Item]],
+        live: Collection[str],
+        pace: Pace | None,
+        stop: Stop,
+    ) -> None:
+        self._recorded = recorded.cut() if live else recorded
+        self._items = items
+        self._live = live
+        self._pace = pace
+        self._playing: Playing | None = None
+        self._member = Membership('record', 'record', stop)
+        self._cast = Cast(self._member, self._recorded, live)
+
+    def run(self) -> int:
+        """Play everything and print what was played; returns the exit code of the process."""
+        code = Node(self._member, self._join, self._wire).run()
+        if self._playing is not None:
+            self._playing.print_counts()
+        return code
+
+    def _join(self, member: Membership) -> Joined | None:
+        if not self._cast.play('learner', 'learner'):
+            return None
+        return join(member, lambda: self._make)
+
+    def _make(self, _: RunSpec, settings: Settings, *_more: object) -> Playback:
+        learners = [role for role in LEARNERS if role in self._live]
+        phases = settings.phases if self._live else self._recorded.phases
+        return Playback(self._items(), phases, settings.lag, learners, self._pace)
+
+    def _wire(self, member: Membership, joined: Joined) -> Playing:
+        self._playing = Playing(member, joined, self._recorded, self._live, self._cast)
+        return self._playing
 
 
 def play(
     recorded: Recorded,
-    found: Callable[[], Iterator[Item]],
+    items: Callable[[], Iterator[Item]],
     live: Collection[str],
     pace: Pace | None,
     namespace: str,
@@ -274,7 +295,7 @@ def play(
 
     Args:
         recorded: the run.
-        found: makes an iterator over its messages.
+        items: makes an iterator over its messages.
         live: roles whose nodes are there themselves.
         pace: when messages are due at the earliest; None: at once.
         namespace: where to publish, such as '/play'.
@@ -289,10 +310,7 @@ def play(
         args=['play', '--ros-args', *arguments], signal_handler_options=SignalHandlerOptions.NO
     )
     try:
-        node = PlayNode(recorded, found, live, pace, stop)
-        code = node.run()
-        node.say_what_was_played()
-        return code
+        return Player(recorded, items, live, pace, stop).run()
     finally:
         rclpy.try_shutdown()
         signals.ignore()

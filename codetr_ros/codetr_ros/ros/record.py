@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from codetr_ros.ros.signals import Stop
 
 if TYPE_CHECKING:
-    from codetr_ros.ros.node import MakeCore
+    from codetr_ros.ros.joining import MakeCore
 
 
 def load() -> 'MakeCore':
@@ -20,9 +20,9 @@ def main(argv: list[str] | None = None) -> int:
     """Entry point; the imports follow the signal handlers, since they take a while."""
     stop = Stop().install()
     from codetr_ros.ros.node import run_node
-    from codetr_ros.ros.recording import RecordNode
+    from codetr_ros.ros.recording import Recording
 
-    return run_node('record', 'record', load, argv, stop, RecordNode)
+    return run_node('record', 'record', load, argv, stop, Recording)
 
 
 if __name__ == '__main__':

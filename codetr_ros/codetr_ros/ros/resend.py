@@ -3,7 +3,7 @@
 from codetr_msgs.srv import FetchPhase
 
 from codetr_ros.records import Commit, CompositeReward, Record, Transitions
-from codetr_ros.ros import messages
+from codetr_ros.records.fields import type_name
 from codetr_ros.ros.fetch import SERVICE
 from codetr_ros.ros.link import Link
 
@@ -25,7 +25,7 @@ class LastPhases:
 
     def commit(self, commit: Commit, raw: bytes) -> None:
         """File under the commit's phase what it names; forget the oldest phase."""
-        last = {
+        last: dict[tuple[type, str], int] = {
             (Transitions, s): n
             for s, n in zip(commit.sources, commit.transitions.tolist(), strict=True)
         }
@@ -85,7 +85,7 @@ class Resender(LastPhases):
             f'{request.requester} lacks something of phase {request.phase}: sending it again'
         )
         response.found = True
-        response.types = [messages.type_name(kind) for kind, _ in found]
+        response.types = [type_name(kind) for kind, _ in found]
         response.lengths = [len(raw) for _, raw in found]
         response.cdr = b''.join(raw for _, raw in found)
         return response

@@ -1,0 +1,281 @@
+"""A node's place among the others of a run: who it is, who is there, what came, what is lost."""
+
+import hashlib
+import secrets
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codetr_ros.cores.core import Core, Silent
+from codetr_ros.records import (
+    PROTOCOL_VERSION,
+    TOPICS,
+    Commit,
+    Presence,
+    Record,
+    RecordError,
+    RunSpec,
+    describe,
+)
+from codetr_ros.records.roles import published_by
+from codetr_ros.ros import link, messages, parameters
+from codetr_ros.ros.errors import NodeError
+from codetr_ros.ros.fetch import Fetcher
+from codetr_ros.ros.link import Link
+from codetr_ros.ros.peers import Ledger, Peers
+from codetr_ros.ros.signals import Stop
+
+PRESENCE_EVERY = 1.0  # [s] between two messages of presence and diagnostics
+
+
+class Membership:
+    """What a node is to the others of its run: it publishes its presence, notes theirs, hands
+    records to its core and counts them.
+
+    Attributes:
+        link: the node's connection to ROS.
+        log: the node's logger.
+        peers: the other nodes.
+        company: members in the same process, which take their turns with this one.
+        values: the node's own parameters, once they are declared.
+        run: the run, once it is known.
+        announcement: the message in which the run came; None where the node made it itself.
+        core: who takes the records; a silent one until the node has joined.
+        begun: whether all peers were there; from then on a nuisance ends no node.
+        doing: what the node does now, for people.
+        received: records that came on each topic, sound or not.
+        refused: those of them that were refused.
+        recovered: records by topic that were lost, and came when they were asked for again.
+        lost_for_good: what will not come any more, by topic, once that is certain.
+
+    Args:
+        role: one of `records.ROLES`.
+        name: node name unless remapped.
+        stop: true once the process is asked to stop.
+    """
+
+    def __init__(self, role: str, name: str, stop: Stop) -> None:
+        self.role = role
+        self.stop = stop
+        self.link = Link(name)
+        self.log = self.link.node.get_logger()
+        self.peers = Peers(role)
+        self.company: list[Membership] = []
+        self.values: dict[str, Any] = {}
+        self.run: RunSpec | None = None
+        self.announcement: Any = None
+        self.core: Core[Any] = Silent()
+        self.begun = False
+        self.doing = 'starting'
+        self.received: Counter[str] = Counter()
+        self.refused: Counter[str] = Counter()
+        self.recovered: Counter[str] = Counter()
+        self.lost_for_good: dict[str, int] | None = None
+        self._instance = secrets.token_hex(8)
+        self._serves = False  # the core is made: the run's settings are taken
+        self._ledger = Ledger()
+        self._fetcher: Fetcher | None = None
+        self._logged: set[str] = set()  # errors that are logged once
+        self._presence_at = 0.0
+
+    @property
+    def folder(self) -> Path | None:
+        """The folder of the run, where the node was given one."""
+        return Path(self.values['folder']) if self.values.get('folder') else None
+
+    @property
+    def deadline(self) -> float:
+        """Seconds of patience with peers; 0: for ever."""
+        return float(self.values['peer_deadline'])
+
+    def introduce(self) -> None:
+        """Declare the node's own parameters, and listen to presences and runs.
+
+        Raises:
+            ParameterError: one is unknown, of the wrong type or out of range.
+        """
+        parameters.check_names(self.link.node, self.role)
+        self.values = parameters.declare_own(self.link.node, self.role)
+        self.link.advertise(['presence'])
+        self.link.subscribe(Presence, self.take)
+        self.link.subscribe(RunSpec, self.take)
+
+    def serve(self, core: Core[Any]) -> None:
+        """Hand records to a core from now on, and have what it lacks sent again."""
+        self.core = core
+        self._serves = True
+        if self.run is not None and Commit in core.subscribes:
+            self._fetcher = Fetcher(self.link, self.run.run_id, self.receive_again)
+
+    def turn(self, wait: float = 0.0) -> None:
+        """Let ROS have its turn: take what arrived, publish presence when it is time.
+
+        Args:
+            wait: seconds to block for something to arrive, if nothing has.
+        """
+        self.link.handle(wait)
+        if time.monotonic() - self._presence_at >= PRESENCE_EVERY:
+            self.publish_presence()
+        if self._fetcher is not None and self.begun:
+            self._fetcher.check(self.core.missing)
+        for other in self.company:
+            other.turn()
+
+    # ---- records
+
+    def take(self, kind: type, message: Any) -> None:
+        """Take a message that arrived, whatever it is."""
+        if kind not in (Presence, RunSpec):
+            self.received[TOPICS[kind]] += 1  # sound or not, it is not lost
+        try:
+            record = messages.from_message(message)
+            if isinstance(record, Presence):
+                self._note_peer(record)
+            elif isinstance(record, RunSpec):
+                self._note_run(record, message)
+            else:
+                self.receive(record)
+        except RecordError as error:
+            self.refuse(kind, error)
+
+    def receive(self, record: Record) -> bool:
+        """Hand a record to the core; whether it was new and taken."""
+        before = self.core.duplicated.total()
+        try:
+            self.core.receive(record)
+        except RecordError as error:
+            self.refuse(type(record), error)
+            return False
+        return self.core.duplicated.total() == before
+
+    def receive_again(self, record: Record) -> None:
+        """Hand over a record that came because it was asked for; what is new was lost before."""
+        # who asks for what a commit names has the commit
+        if self.receive(record) and not isinstance(record, Commit):
+            self.recovered[TOPICS[type(record)]] += 1
+
+    def refuse(self, kind: type, error: RecordError) -> None:
+        """Count a refusal; log the first ten on a topic, then every thousandth."""
+        topic = TOPICS[kind]
+        self.refused[topic] += 1
+        n = self.refused[topic]
+        if n <= 10 or n % 1000 == 0:
+            self.log.error(f'refused on {topic!r} (number {n}): {error}')
+
+    def lost(self) -> dict[str, int]:
+        """Records by topic that peers published a while ago, as their presence has it, and that
+        have not come, not even when they were asked for again.
+        """
+        if self.lost_for_good is not None:
+            return self.lost_for_good
+        wanted = {TOPICS[kind] for kind in self.core.subscribes}
+        lost = self._ledger.lost(self.received + self.recovered, time.monotonic())
+        return {topic: n for topic, n in lost.items() if topic in wanted}
+
+    # ---- runs and peers
+
+    def _note_run(self, spec: RunSpec, message: Any) -> None:
+        own = self.run
+        if own is not None and spec.run_id == own.run_id:
+            return
+        if spec.protocol_version != PROTOCOL_VERSION:
+            raise RecordError(
+                f'{describe(spec)}: run {spec.run_id!r} speaks protocol_version '
+                f'{spec.protocol_version}, {self.link.full_name} speaks {PROTOCOL_VERSION}: '
+                'install the same version of codetr_ros everywhere'
+            )
+        if hashlib.sha256(spec.settings.encode()).hexdigest() != spec.settings_hash:
+            raise RecordError(
+                f'run {spec.run_id!r}: settings_hash {spec.settings_hash!r} is not that of its '
+                'settings: install the same version of codetr_ros everywhere'
+            )
+        if own is not None:
+            problem = (
+                f'a second run in the namespace of {self.link.full_name}: {spec.run_id!r} '
+                f'beside {own.run_id!r}. Stop one of them, or give each run a namespace of its '
+                'own (--ros-args -r __ns:=/other)'
+            )
+            if self.role == 'learner' and not self.begun:
+                raise NodeError(problem)
+            raise RecordError(problem)
+        if self.values['run_id'] not in ('', spec.run_id):
+            raise RecordError(
+                f'run {spec.run_id!r} is not the one that {self.link.full_name} was started for '
+                f'(parameter run_id = {self.values["run_id"]!r}): leave run_id out, or start '
+                'that learner'
+            )
+        self.received['run'] += 1
+        self.run, self.announcement = spec, message
+
+    def _note_peer(self, presence: Presence) -> None:
+        if presence.instance_id == self._instance:
+            return
+        own = self.run.run_id if self.run else ''
+        if own and presence.run_id not in ('', own):
+            self._log_once(
+                f'{presence.role} {presence.node} is part of another run, {presence.run_id!r}; '
+                f'this is {own!r}'
+            )
+            return
+        if presence.node == self.link.full_name and not presence.finished:
+            problem = (
+                f'two nodes are called {presence.node}: start one of them with another name '
+                '(--ros-args -r __node:=other)'
+            )
+            if not self.begun:
+                raise NodeError(problem)
+            self._log_once(problem)
+            return
+        now = time.monotonic()
+        news = self.peers.hear(presence, now)
+        if news:
+            self.log.info(news)
+        self._ledger.tell(self.peers.told(), now)
+
+    def _log_once(self, text: str) -> None:
+        if text not in self._logged:
+            self._logged.add(text)
+            self.log.error(text)
+
+    def publish_presence(self, finished: bool = False) -> None:
+        """Publish that the node is there, and on /diagnostics how its messages fare.
+
+        Args:
+            finished: whether it is the last time.
+        """
+        self._presence_at = time.monotonic()
+        topics = tuple(t for t in published_by(self.role) if t in self.link.published)
+        lost = self.lost()
+        self.link.publish(
+            Presence(
+                run_id=self.run.run_id if self.run else '',
+                role=self.role,
+                node=self.link.full_name,
+                instance_id=self._instance,
+                settings_hash=self.run.settings_hash if self.run and self._serves else '',
+                finished=finished,
+                topics=topics,
+                published=np.array([self.link.published[t] for t in topics], np.uint64),
+                missed=sum(lost.values()),
+            )
+        )
+        counters = {
+            'published': dict(self.link.published),
+            'received': dict(self.received),
+            'lost': lost,
+            'duplicated': dict(self.core.duplicated),
+            'refused': dict(self.refused + self.core.refused),
+        }
+        wrong = bool(lost or counters['refused'])
+        self.link.diagnose(
+            link.WARN if wrong else link.OK, 'has finished' if finished else self.doing, counters
+        )
+
+    def close(self) -> None:
+        """Take the node, and whoever keeps it company, off the graph."""
+        for other in self.company:
+            other.close()
+        self.link.close()

@@ -1,0 +1,75 @@
+"""How the core of a node is wired to the topics of its run."""
+
+from collections.abc import Callable
+from typing import Any
+
+from codetr_ros.records.roles import published_by
+from codetr_ros.ros.gathering import absent_or_unmatched
+from codetr_ros.ros.joining import Joined
+from codetr_ros.ros.membership import Membership
+from codetr_ros.runs.reports import BagReport
+
+
+class Wiring:
+    """The wiring of most nodes: what the core subscribes to goes in, what it yields goes out.
+
+    Args:
+        member: the node's membership.
+        joined: what it has joined.
+    """
+
+    def __init__(self, member: Membership, joined: Joined) -> None:
+        self.member = member
+        self.joined = joined
+        self.log = member.log
+
+    def enter(self) -> None:
+        """Open the topics, and be known as one who has joined."""
+        run, settings = self.joined.run, self.joined.settings
+        self.member.link.advertise(published_by(self.member.role), settings)
+        self.open()
+        self.log.info(f'run {run.run_id}: task {settings.task}, method {settings.method}')
+        self.member.publish_presence()
+
+    def open(self) -> None:
+        """Subscribe to what the core wants."""
+        for kind in self.joined.core.subscribes:
+            self.member.link.subscribe(kind, self.take, self.joined.settings)
+
+    def take(self, kind: type, message: Any) -> None:
+        """Take a message that arrived on one of these topics."""
+        self.member.take(kind, message)
+
+    def complete(self) -> bool:
+        """Do what must be done before the peers can all be there; false if asked to stop
+        meanwhile.
+        """
+        return True
+
+    def lacking(self) -> list[str]:
+        """Who is not there yet, or not matched."""
+        run, settings = self.joined.run, self.joined.settings
+        return absent_or_unmatched(self.member, settings, run.settings_hash, settings.roles)
+
+    def deliver(self, given: Any) -> None:
+        """Pass on what the core yielded: a record."""
+        self.member.link.publish(given)
+
+    def waits(self) -> str:
+        """What the node waits for, in words."""
+        return f'waits for {self.joined.core.waiting_for()}'
+
+    def settled(self, seconds: float) -> bool:
+        """Whether a node whose core has finished `seconds` ago may end."""
+        return True
+
+    def close(self) -> None:
+        """Finish what the wiring itself holds open, once nothing more will arrive."""
+
+    def report(self) -> BagReport | None:
+        """What the wiring adds to the core's report."""
+        return None
+
+
+Wire = Callable[[Membership, Joined], Wiring]
+"""Makes the wiring of a node that has joined; opens nothing yet."""
