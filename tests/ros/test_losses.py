@@ -129,7 +129,7 @@ def test_diagnostics_tell_what_the_core_has_dropped_and_refused_later(member, pl
     witness.links['sim'].node.create_subscription(
         DiagnosticArray, '/diagnostics', heard.append, 10
     )
-    member.refuse(Transitions, RecordError('wrong'))
+    member.traffic.refuse(Transitions, RecordError('wrong'))
 
     def said():
         member.publish_presence()
@@ -147,14 +147,14 @@ def test_what_came_and_was_refused_is_not_lost(member):
     message = messages.to_message(transitions(), Time())
     message.actions = message.actions[:3]  # of another length than it says
     member.take(Transitions, message)
-    assert member.refused == {'transitions': 1}
-    assert member.received == {'transitions': 1}
+    assert member.traffic.refused == {'transitions': 1}
+    assert member.traffic.received == {'transitions': 1}
 
 
 def test_what_is_fetched_counts_as_recovered_only_if_it_was_new_and_taken(member):
     for record in (transitions(sequence=0), transitions(sequence=-1), transitions(sequence=4)):
-        member.receive_again(record)
-    assert member.recovered == {'transitions': 1}
+        member.traffic.receive_again(record)
+    assert member.traffic.recovered == {'transitions': 1}
 
 
 def test_what_the_core_has_not_taken_is_not_sent_again(play, tmp_path):

@@ -3,19 +3,17 @@
 import hashlib
 import secrets
 import time
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from codetr_ros.cores.core import Core, Silent
+from codetr_ros.cores.core import Core
 from codetr_ros.records import (
     PROTOCOL_VERSION,
     TOPICS,
     Commit,
     Presence,
-    Record,
     RecordError,
     RunSpec,
     describe,
@@ -25,31 +23,28 @@ from codetr_ros.ros import link, messages, parameters
 from codetr_ros.ros.errors import NodeError
 from codetr_ros.ros.fetch import Fetcher
 from codetr_ros.ros.link import Link
-from codetr_ros.ros.peers import Ledger, Peers
+from codetr_ros.ros.peers import Peers
 from codetr_ros.ros.signals import Stop
+from codetr_ros.ros.traffic import Traffic
 
 PRESENCE_EVERY = 1.0  # [s] between two messages of presence and diagnostics
 
 
 class Membership:
-    """What a node is to the others of its run: it publishes its presence, notes theirs, hands
-    records to its core and counts them.
+    """What a node is to the others of its run: it publishes its presence, notes theirs, and takes
+    what they publish.
 
     Attributes:
         link: the node's connection to ROS.
         log: the node's logger.
         peers: the other nodes.
+        traffic: what reaches the node's core, and how its messages fare.
         company: members in the same process, which take their turns with this one.
         values: the node's own parameters, once they are declared.
         run: the run, once it is known.
         announcement: the message in which the run came; None where the node made it itself.
-        core: who takes the records; a silent one until the node has joined.
         begun: whether all peers were there; from then on a nuisance ends no node.
         doing: what the node does now, for people.
-        received: records that came on each topic, sound or not.
-        refused: those of them that were refused.
-        recovered: records by topic that were lost, and came when they were asked for again.
-        lost_for_good: what will not come any more, by topic, once that is certain.
 
     Args:
         role: one of `records.ROLES`.
@@ -63,20 +58,15 @@ class Membership:
         self.link = Link(name)
         self.log = self.link.node.get_logger()
         self.peers = Peers(role)
+        self.traffic = Traffic(self.log)
         self.company: list[Membership] = []
         self.values: dict[str, Any] = {}
         self.run: RunSpec | None = None
         self.announcement: Any = None
-        self.core: Core[Any] = Silent()
         self.begun = False
         self.doing = 'starting'
-        self.received: Counter[str] = Counter()
-        self.refused: Counter[str] = Counter()
-        self.recovered: Counter[str] = Counter()
-        self.lost_for_good: dict[str, int] | None = None
         self._instance = secrets.token_hex(8)
         self._serves = False  # the core is made: the run's settings are taken
-        self._ledger = Ledger()
         self._fetcher: Fetcher | None = None
         self._logged: set[str] = set()  # errors that are logged once
         self._presence_at = 0.0
@@ -105,10 +95,10 @@ class Membership:
 
     def serve(self, core: Core[Any]) -> None:
         """Hand records to a core from now on, and have what it lacks sent again."""
-        self.core = core
+        self.traffic.core = core
         self._serves = True
         if self.run is not None and Commit in core.subscribes:
-            self._fetcher = Fetcher(self.link, self.run.run_id, self.receive_again)
+            self._fetcher = Fetcher(self.link, self.run.run_id, self.traffic.receive_again)
 
     def turn(self, wait: float = 0.0) -> None:
         """Let ROS have its turn: take what arrived, publish presence when it is time.
@@ -120,7 +110,7 @@ class Membership:
         if time.monotonic() - self._presence_at >= PRESENCE_EVERY:
             self.publish_presence()
         if self._fetcher is not None and self.begun:
-            self._fetcher.check(self.core.missing)
+            self._fetcher.check(self.traffic.core.missing)
         for other in self.company:
             other.turn()
 
@@ -129,7 +119,7 @@ class Membership:
     def take(self, kind: type, message: Any) -> None:
         """Take a message that arrived, whatever it is."""
         if kind not in (Presence, RunSpec):
-            self.received[TOPICS[kind]] += 1  # sound or not, it is not lost
+            self.traffic.received[TOPICS[kind]] += 1  # sound or not, it is not lost
         try:
             record = messages.from_message(message)
             if isinstance(record, Presence):
@@ -137,43 +127,9 @@ class Membership:
             elif isinstance(record, RunSpec):
                 self._note_run(record, message)
             else:
-                self.receive(record)
+                self.traffic.receive(record)
         except RecordError as error:
-            self.refuse(kind, error)
-
-    def receive(self, record: Record) -> bool:
-        """Hand a record to the core; whether it was new and taken."""
-        before = self.core.duplicated.total()
-        try:
-            self.core.receive(record)
-        except RecordError as error:
-            self.refuse(type(record), error)
-            return False
-        return self.core.duplicated.total() == before
-
-    def receive_again(self, record: Record) -> None:
-        """Hand over a record that came because it was asked for; what is new was lost before."""
-        # who asks for what a commit names has the commit
-        if self.receive(record) and not isinstance(record, Commit):
-            self.recovered[TOPICS[type(record)]] += 1
-
-    def refuse(self, kind: type, error: RecordError) -> None:
-        """Count a refusal; log the first ten on a topic, then every thousandth."""
-        topic = TOPICS[kind]
-        self.refused[topic] += 1
-        n = self.refused[topic]
-        if n <= 10 or n % 1000 == 0:
-            self.log.error(f'refused on {topic!r} (number {n}): {error}')
-
-    def lost(self) -> dict[str, int]:
-        """Records by topic that peers published a while ago, as their presence has it, and that
-        have not come, not even when they were asked for again.
-        """
-        if self.lost_for_good is not None:
-            return self.lost_for_good
-        wanted = {TOPICS[kind] for kind in self.core.subscribes}
-        lost = self._ledger.lost(self.received + self.recovered, time.monotonic())
-        return {topic: n for topic, n in lost.items() if topic in wanted}
+            self.traffic.refuse(kind, error)
 
     # ---- runs and peers
 
@@ -207,7 +163,7 @@ class Membership:
                 f'(parameter run_id = {self.values["run_id"]!r}): leave run_id out, or start '
                 'that learner'
             )
-        self.received['run'] += 1
+        self.traffic.received['run'] += 1
         self.run, self.announcement = spec, message
 
     def _note_peer(self, presence: Presence) -> None:
@@ -233,7 +189,7 @@ class Membership:
         news = self.peers.hear(presence, now)
         if news:
             self.log.info(news)
-        self._ledger.tell(self.peers.told(), now)
+        self.traffic.ledger.tell(self.peers.told(), now)
 
     def _log_once(self, text: str) -> None:
         if text not in self._logged:
@@ -248,7 +204,7 @@ class Membership:
         """
         self._presence_at = time.monotonic()
         topics = tuple(t for t in published_by(self.role) if t in self.link.published)
-        lost = self.lost()
+        counters = self.traffic.counters()
         self.link.publish(
             Presence(
                 run_id=self.run.run_id if self.run else '',
@@ -259,19 +215,14 @@ class Membership:
                 finished=finished,
                 topics=topics,
                 published=np.array([self.link.published[t] for t in topics], np.uint64),
-                missed=sum(lost.values()),
+                missed=sum(counters['lost'].values()),
             )
         )
-        counters = {
-            'published': dict(self.link.published),
-            'received': dict(self.received),
-            'lost': lost,
-            'duplicated': dict(self.core.duplicated),
-            'refused': dict(self.refused + self.core.refused),
-        }
-        wrong = bool(lost or counters['refused'])
+        wrong = bool(counters['lost'] or counters['refused'])
         self.link.diagnose(
-            link.WARN if wrong else link.OK, 'has finished' if finished else self.doing, counters
+            link.WARN if wrong else link.OK,
+            'has finished' if finished else self.doing,
+            {'published': dict(self.link.published)} | counters,
         )
 
     def close(self) -> None:

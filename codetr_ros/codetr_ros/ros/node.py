@@ -124,7 +124,7 @@ class Node:
                     return
             else:
                 member.doing = wiring.waits()
-                patience.check(now, now - waiting, member.doing, member.lost())
+                patience.check(now, now - waiting, member.doing, member.traffic.lost())
             member.turn(IDLE)
 
     def _end(self, wiring: Wiring | None, error: str | None) -> int:
@@ -166,10 +166,10 @@ class Node:
             role=member.role,
             name=member.link.name,
             published={t: n for t, n in member.link.published.items() if t != 'presence'},
-            received=member.received,
-            refused=member.refused,
-            lost=member.lost(),
-            fetched=member.recovered,
+            received=member.traffic.received,
+            refused=member.traffic.refused,
+            lost=member.traffic.lost(),
+            fetched=member.traffic.recovered,
             cpu_s=used.ru_utime + used.ru_stime,
             wall_s=time.monotonic() - self._started,
             finished=finished,

@@ -50,7 +50,7 @@ class PlayedWiring(Wiring):
                 self.member.link.subscribe(kind, self._pass, settings, raw=True)
 
     def _pass(self, kind: type, raw: bytes) -> None:
-        self.member.received[TOPICS[kind]] += 1
+        self.member.traffic.received[TOPICS[kind]] += 1
 
     def lacking(self) -> list[str]:
         """Who is not there yet, or not matched."""

@@ -81,7 +81,7 @@ class Recording(Wiring):
 
     def take(self, kind: type, raw: bytes) -> None:
         """Write the bytes of a message as they came, and hand the record to the core."""
-        self.member.received[TOPICS[kind]] += 1
+        self.member.traffic.received[TOPICS[kind]] += 1
         if self._bag is not None and self._bag.closed:
             return  # stopped: others may still publish
         message = deserialize_message(raw, messages.message_type(kind))
@@ -92,10 +92,10 @@ class Recording(Wiring):
         except RecordError as error:
             if message.run_id == self.joined.run.run_id:
                 self._write(kind, raw, published)  # the bag tells what came, sound or not
-            self.member.refuse(kind, error)
+            self.member.traffic.refuse(kind, error)
             return
         self._write(kind, self._kept(record, raw, message), published)
-        if kind in self.joined.core.subscribes and self.member.receive(record):
+        if kind in self.joined.core.subscribes and self.member.traffic.receive(record):
             self._last.hold(record, raw)
 
     def _kept(self, record: Record, raw: bytes, message: Any) -> bytes:
@@ -139,7 +139,8 @@ class Recording(Wiring):
         due = member.peers.told()
         ours = published_by(member.role)
         due.update({t: n for t, n in member.link.published.items() if t in ours})
-        arrived = member.received + Counter({TOPICS[Commit]: self._recorded[TOPICS[Commit]]})
+        commits = TOPICS[Commit]
+        arrived = member.traffic.received + Counter({commits: self._recorded[commits]})
         return {
             topic: n - arrived[topic] for topic, n in sorted(due.items()) if n > arrived[topic]
         }
@@ -148,7 +149,7 @@ class Recording(Wiring):
         """Whether everybody has finished and all that they published is in the bag."""
         peers, deadline = self.member.peers, self.member.deadline
         running = [f'{p.said.role} {p.said.node}' for p in peers.newest() if not p.said.finished]
-        missing = self.member.lost_for_good = self._still_missing()
+        missing = self.member.traffic.lost_for_good = self._still_missing()
         if not running and not missing:
             return True
         lacking = [f'{n} of {topic}' for topic, n in missing.items()]
