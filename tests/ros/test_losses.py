@@ -10,7 +10,14 @@ from codetr_msgs.srv import FetchPhase
 from diagnostic_msgs.msg import DiagnosticArray
 from rosbags.highlevel import AnyReader
 
-from codetr_ros.records import Commit, CompositeReward, Presence, RecordError, Transitions
+from codetr_ros.records import (
+    Commit,
+    CompositeReward,
+    Policy,
+    Presence,
+    RecordError,
+    Transitions,
+)
 from codetr_ros.ros import messages
 from codetr_ros.ros.fetch import unpack
 from codetr_ros.ros.membership import Membership
@@ -155,6 +162,18 @@ def test_what_is_fetched_counts_as_recovered_only_if_it_was_new_and_taken(member
     for record in (transitions(sequence=0), transitions(sequence=-1), transitions(sequence=4)):
         member.traffic.receive_again(record)
     assert member.traffic.recovered == {'transitions': 1}
+
+
+@pytest.mark.parametrize(('kinds', 'clients'), [((Transitions, Commit), 1), ((Policy,), 0)])
+def test_only_a_node_that_takes_phases_in_asks_for_them_again(play, kinds, clients):
+    play = play(roles=())
+    member = Membership('reward', 'reward', Stop())
+    member.run = play.spec
+    core = Core()
+    core.subscribes = kinds
+    member.serve(core)
+    assert [c.srv_name for c in member.link.node.clients] == ['fetch_phase'] * clients
+    member.close()
 
 
 def test_what_the_core_has_not_taken_is_not_sent_again(play, tmp_path):

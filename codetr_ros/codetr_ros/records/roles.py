@@ -24,7 +24,7 @@ from codetr_ros.records.kinds import (
 )
 
 
-class Deciding(Protocol):
+class DecidingSettings(Protocol):
     """The settings of a run that decide who takes part."""
 
     @property
@@ -60,7 +60,7 @@ class Role:
     publishes: tuple[type, ...]
     reads: tuple[type, ...]
     relies_on: tuple[str, ...]
-    count: Callable[[Deciding], int] = lambda settings: 1
+    count: Callable[[DecidingSettings], int] = lambda settings: 1
     reads_unlabelled: tuple[type, ...] | None = None
 
 
@@ -110,7 +110,7 @@ def command(role: str) -> str:
     return f'ros2 run {TABLE[role].package} {TABLE[role].executable}'
 
 
-def needed(settings: Deciding) -> dict[str, int]:
+def needed(settings: DecidingSettings) -> dict[str, int]:
     """How many nodes of each role a run needs, in the order in which they start: the learner,
     which makes the run, last.
     """

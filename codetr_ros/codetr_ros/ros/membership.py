@@ -1,4 +1,4 @@
-"""A node's place among the others of a run: who it is, who is there, what came, what is lost."""
+"""A node's place among the others of a run: who it is, which run it is, and who else is there."""
 
 import hashlib
 import secrets
@@ -35,6 +35,8 @@ class Membership:
     what they publish.
 
     Attributes:
+        role: one of `records.ROLES`.
+        stop: true once the process is asked to stop.
         link: the node's connection to ROS.
         log: the node's logger.
         peers: the other nodes.
