@@ -170,7 +170,7 @@ def one_run(variant: Variant, device: str, smallest: bool) -> dict[str, float | 
     with switched(variant), tempfile.TemporaryDirectory() as folder, watch.sampling():
         reports = in_process.run(settings, 'run', Path(folder), watch.receive)
         row = watch.row()
-    row['evaluate'] = reports['evaluate']['cpu_s']
+    row['evaluate'] = reports['evaluate'].cpu_s
     used = sum(float(row[stage]) for stage in STAGES)
     row['else'] = '' if settings.evaluate_every else float(row['seconds']) - used
     return {'steps': settings.steps} | row
