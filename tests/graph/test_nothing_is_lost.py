@@ -105,7 +105,7 @@ def check_labels(bag: dict[str, list[Any]], settings: Settings) -> None:
 def test_the_default_run_loses_nothing_and_its_bag_holds_everything(tmp_path):
     """The default task and settings, shortened to what shows it."""
     settings = load('quick').changed({'steps': 4000})
-    summary, said = train(settings, tmp_path / 'run')
+    summary, said = train(settings, tmp_path / 'run', installed=True)
     check(summary, settings)
     assert summary['steps'] == 4000 and summary['phases'] == 4
     assert 'lost' in said

@@ -1,7 +1,6 @@
 """What learns from a bag that is played ends with the weights of the run that was recorded."""
 
 import os
-import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,9 @@ from codetr_ros.config import Settings
 from codetr_ros.runs import checkpoints
 from codetr_ros.runs import folder as run_folder
 from helpers.builders import tiny
+from helpers.forked import codetr
 from helpers.nodes import NAMESPACE, Nodes, domain
-from helpers.runs import CODETR, DEADLINE, train
+from helpers.runs import DEADLINE, train
 
 
 @dataclass
@@ -47,23 +47,17 @@ def play(bag: Path, nodes: Nodes, *live: str) -> str:
     with nodes:
         for name in live:
             nodes.start(name)
-        done = subprocess.run(
-            [CODETR, 'bag', 'play', bag, '--to', *live, '--namespace', NAMESPACE],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            timeout=DEADLINE,
-            env=os.environ,
-            check=False,
-        )
-        assert done.returncode == 0, done.stdout + ''.join(map(nodes.log, live))
+        flags = ('--to', *live, '--namespace', NAMESPACE)
+        player = codetr('bag', 'play', str(bag), *flags, environment=os.environ)
+        said, _ = player.communicate(DEADLINE)
+        assert player.returncode == 0, said + ''.join(map(nodes.log, live))
         assert nodes.wait() == dict.fromkeys(live, 0), ''.join(map(nodes.log, live))
     for name in live:
         report = nodes.report(name)
         assert report['lost'] == report['refused'] == report['duplicated'] == {}
         assert report['fetched'] == {} and report['finished']
-    assert 'Traceback' not in done.stdout
-    return done.stdout
+    assert 'Traceback' not in said
+    return said
 
 
 @pytest.mark.slow

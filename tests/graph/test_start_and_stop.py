@@ -13,13 +13,14 @@ pytest.importorskip('rclpy', reason='needs ROS')
 from rcl_interfaces.msg import ParameterType
 from rosbags.highlevel import AnyReader
 
+from codetr_ros.processes import launcher
 from codetr_ros.records import TOPICS, TrueRewards
 from codetr_ros.records.roles import command, readers
 from codetr_ros.runs import checkpoints
 from codetr_ros.runs import folder as run_folder
 from helpers.builders import tiny
 from helpers.nodes import NAMESPACE, Nodes, Witness, domain
-from helpers.runs import finish, logs, processes_of, start, until, write
+from helpers.runs import finish, logs, processes_of, start_installed, until, write
 
 ENDLESS = 10_000_000  # steps
 STOPS = (signal.SIGINT, signal.SIGTERM)
@@ -54,7 +55,8 @@ def check_saved(folder: Path) -> None:
 
 def test_nodes_start_in_any_order_and_finish(tmp_path):
     settings = tiny()
-    with domain(), Nodes(settings, tmp_path / 'run') as nodes, Witness(nodes) as witness:
+    installed = Nodes(settings, tmp_path / 'run', launcher.start_program)
+    with domain(), installed as nodes, Witness(nodes) as witness:
         for name in ('record', 'evaluate', 'sim', 'reward'):
             nodes.start(name)
             witness.until(lambda name=name: name in witness.presence)
@@ -208,7 +210,7 @@ def interrupted(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp('interrupted') / 'run'
     with domain():
         config = write(tiny(steps=ENDLESS, memory_steps=10_000), folder)
-        command = start(config, folder)
+        command = start_installed(config, folder)
         try:
             until(lambda: saved_by_both(folder), command, folder)
             command.send_signal(request.param)
@@ -245,7 +247,7 @@ def test_ctrl_c_leaves_no_process_behind(interrupted):
 
 def test_a_node_that_is_killed_ends_the_run_which_names_it_and_leaves_no_process(tmp_path):
     folder = tmp_path / 'run'
-    command = start(write(tiny(steps=ENDLESS, memory_steps=10_000), folder), folder)
+    command = start_installed(write(tiny(steps=ENDLESS, memory_steps=10_000), folder), folder)
     try:
         until(lambda: saved_by_both(folder), command, folder)
         for number, words in processes_of(folder):

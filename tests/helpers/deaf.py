@@ -1,7 +1,5 @@
 """The reward node, which no transitions reach: as if the network had lost them all."""
 
-import sys
-
 from codetr_ros.records import Transitions
 from codetr_ros.ros.node import run_node
 from codetr_ros.ros.wiring import Wiring
@@ -14,5 +12,5 @@ class Deaf(Wiring):
             super().take(kind, message)
 
 
-if __name__ == '__main__':
-    sys.exit(run_node('reward', 'reward', load, wire=Deaf))
+def main() -> int:
+    return run_node('reward', 'reward', load, wire=Deaf)

@@ -1,4 +1,4 @@
-"""The nodes of a run, started one by one as `ros2 run` starts them, and a witness in their
+"""The nodes of a run, started one by one with what `ros2 run` gives them, and a witness in their
 namespace that hears everything and can say anything.
 """
 
@@ -23,6 +23,7 @@ from codetr_ros.records import TOPICS, Commit, CompositeReward, Presence, Record
 from codetr_ros.ros import messages, qos
 from codetr_ros.ros.link import Link
 from codetr_ros.runs import folder as run_folder
+from helpers import forked
 
 PATIENCE = 120.0  # [s] a busy machine starts five nodes in 40
 RUN_ID = 'run'
@@ -49,15 +50,18 @@ class Nodes:
     Args:
         settings: of the run.
         folder: of the run.
+        start: starts them: forked, or `launcher.start_program`.
     """
 
-    def __init__(self, settings: Settings, folder: Path) -> None:
+    def __init__(
+        self, settings: Settings, folder: Path, start: launcher.Start = forked.start_program
+    ) -> None:
         self.settings = settings
         self.folder = run_folder.create(folder)
         run_folder.write_settings(folder, settings)
         self._commands = {c.name: c for c in launcher.commands(settings, RUN_ID, folder)}
         self._environment = launcher.environment(settings)
-        self._processes = launcher.Processes(print)
+        self._processes = launcher.Processes(print, start_program=start)
         self.names = tuple(self._commands)
 
     def start(self, name: str, *parameters: str) -> None:

@@ -1,10 +1,8 @@
 """Nodes as processes, and peers that a test plays itself over real topics."""
 
-import subprocess
-import sys
+import os
 import time
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 
@@ -12,13 +10,14 @@ from codetr_ros.records import TOPICS, Presence, RunSpec
 from codetr_ros.records.roles import published_by, readers
 from codetr_ros.ros.link import Link
 from helpers.builders import policy, score, task_spec, transitions
+from helpers.forked import Forked
 
 MODULES = {
     'record': 'codetr_ros.ros.record',
     'sim': 'sim_node.sim',
     'learner': 'learner_node.learner',
     'reward': 'reward_node.reward',
-    'deaf': 'deaf.py',
+    'deaf': 'helpers.deaf',
 }
 NAMESPACE = '/r'
 PATIENCE = 60.0  # discovery and imports on a busy machine
@@ -27,14 +26,11 @@ PATIENCE = 60.0  # discovery and imports on a busy machine
 @contextmanager
 def process(role: str, *parameters: str, name: str | None = None):
     """A node of this role in the namespace of the test; killed at the end if it has not ended."""
-    module = MODULES[role]
-    path = Path(__file__).with_name(module)
-    start = [str(path)] if path.is_file() else ['-m', module]
-    command = [sys.executable, *start, '--ros-args', '-r', f'__ns:={NAMESPACE}']
+    command = [role, '--ros-args', '-r', f'__ns:={NAMESPACE}']
     command += ['-r', f'__node:={name}'] if name else []
     for parameter in parameters:
         command += ['-p', parameter]
-    node = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    node = Forked(command, os.environ, function=f'{MODULES[role]}:main')
     try:
         yield node
     finally:
@@ -43,7 +39,7 @@ def process(role: str, *parameters: str, name: str | None = None):
         node.communicate()
 
 
-def output(node: subprocess.Popen) -> str:
+def output(node: Forked) -> str:
     return node.communicate(timeout=PATIENCE)[0]
 
 

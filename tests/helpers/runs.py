@@ -1,5 +1,6 @@
-"""Whole runs, started as a user starts them: the command `codetr train`, its processes, its
-folder.
+"""Whole runs: the command `codetr train`, its processes, its folder.
+
+They are forked (see `forked`), unless a test is about how a user starts them.
 """
 
 import json
@@ -14,16 +15,21 @@ from typing import Any
 import yaml
 
 from codetr_ros.config import Settings
+from helpers.forked import Forked, codetr
 
 CODETR = Path(sys.prefix) / 'bin' / 'codetr'
 DEADLINE = 300  # [s] far beyond what any of these runs takes
 
 
+Command = Forked | subprocess.Popen[str]
+
+
 def train(
-    settings: Settings, folder: Path, *flags: str, code: int = 0
+    settings: Settings, folder: Path, *flags: str, installed: bool = False
 ) -> tuple[dict[str, Any], str]:
     """Run `codetr train` to its end; its summary and what it printed."""
-    return finish(start(write(settings, folder), folder, *flags), folder, code)
+    begin = start_installed if installed else start
+    return finish(begin(write(settings, folder), folder, *flags), folder)
 
 
 def write(settings: Settings, folder: Path) -> Path:
@@ -33,9 +39,7 @@ def write(settings: Settings, folder: Path) -> Path:
     return config
 
 
-def finish(
-    started: 'subprocess.Popen[str]', folder: Path, code: int = 0
-) -> tuple[dict[str, Any], str]:
+def finish(started: Command, folder: Path, code: int = 0) -> tuple[dict[str, Any], str]:
     """Wait until `codetr train` has ended; its summary and what it printed."""
     try:
         said, _ = started.communicate(timeout=DEADLINE)
@@ -49,8 +53,14 @@ def finish(
     return json.loads((folder / 'summary.json').read_text()), said
 
 
-def start(config: Path, folder: Path, *flags: str) -> 'subprocess.Popen[str]':
-    """Start `codetr train` as a process of its own session."""
+def start(config: Path, folder: Path, *flags: str) -> Forked:
+    """Fork `codetr train`, in a session of its own; its nodes are forked too."""
+    arguments = ('train', '--config', str(config), '--out', str(folder), *flags)
+    return codetr(*arguments, environment=os.environ | {'COLUMNS': '160'})
+
+
+def start_installed(config: Path, folder: Path, *flags: str) -> 'subprocess.Popen[str]':
+    """Start the installed command `codetr train`, in a session of its own."""
     return subprocess.Popen(
         [str(CODETR), 'train', '--config', str(config), '--out', str(folder), *flags],
         stdout=subprocess.PIPE,
@@ -68,7 +78,7 @@ def logs(folder: Path) -> str:
     return '\n'.join(f'--- {path.name}\n{path.read_text()[-2000:]}' for path in found)
 
 
-def until(found: Callable[[], bool], command: 'subprocess.Popen[str]', folder: Path) -> None:
+def until(found: Callable[[], bool], command: Command, folder: Path) -> None:
     """Wait until `found()` is true, as long as a command runs."""
     end = time.monotonic() + DEADLINE
     while not found():

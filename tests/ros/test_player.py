@@ -3,8 +3,6 @@
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,6 +20,7 @@ from codetr_ros.ros.link import Link
 from codetr_ros.runs import folder as run_folder
 from helpers.bags import SETTINGS, a_run, ours, topic_of
 from helpers.builders import run, same
+from helpers.forked import codetr
 from helpers.playing import NAMESPACE, output, process
 
 
@@ -33,11 +32,9 @@ def uniform(phases=3):
 
 @contextmanager
 def player(bag: Path, *flags: str):
-    node = subprocess.Popen(
-        [sys.executable, '-m', 'codetr_ros.cli', 'bag', 'play', bag, '--namespace', NAMESPACE,
-         *flags],
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=os.environ,
-    )  # fmt: skip
+    node = codetr(
+        'bag', 'play', str(bag), '--namespace', NAMESPACE, *flags, environment=os.environ
+    )
     try:
         yield node
     finally:

@@ -7,6 +7,7 @@ import secrets
 import time
 import traceback
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -51,8 +52,13 @@ class Outcome:
     log: Path | None = None  # where the failure is explained
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Train as the command line says; the exit code."""
+def main(arguments: Sequence[str], start: launcher.Start = launcher.start_program) -> int:
+    """Train as the command line says; the exit code.
+
+    Args:
+        arguments: those of `codetr train`.
+        start: starts the nodes.
+    """
     from codetr_ros.simulation import tasks
 
     more = [
@@ -95,7 +101,7 @@ def main(arguments: Sequence[str]) -> int:
         return refuse(str(error))
     # Letters first: as a ROS parameter and part of a namespace it must not read as a number.
     run_id = f'r{stamp.replace("-", "_")}_{secrets.token_hex(2)}'
-    return train(settings, run_id, folder, in_process)
+    return train(settings, run_id, folder, in_process, start)
 
 
 def default_out(settings: Settings, stamp: str) -> str:
@@ -104,7 +110,13 @@ def default_out(settings: Settings, stamp: str) -> str:
     return f'runs/{task}-{settings.method}-{settings.seed}-{stamp}'
 
 
-def train(settings: Settings, run_id: str, folder: Path, in_process: bool) -> int:
+def train(
+    settings: Settings,
+    run_id: str,
+    folder: Path,
+    in_process: bool,
+    start: launcher.Start = launcher.start_program,
+) -> int:
     """Run it, and leave everything about it in its folder.
 
     Args:
@@ -112,6 +124,7 @@ def train(settings: Settings, run_id: str, folder: Path, in_process: bool) -> in
         run_id: its name: letters, digits and `_`.
         folder: its folder, made.
         in_process: without nodes.
+        start: starts the nodes.
 
     Returns:
         The exit code: 0 finished, 1 failed, 2 refused, 130 interrupted.
@@ -130,7 +143,7 @@ def train(settings: Settings, run_id: str, folder: Path, in_process: bool) -> in
     progress.say(f'output: {_short(folder)}')
     with Interrupts() as interrupts:
         with progress:
-            way = _in_process if in_process else _over_topics
+            way = _in_process if in_process else partial(_over_topics, start)
             outcome = way(settings, run_id, folder, summary, progress, interrupts)
         bag = folder / run_folder.BAG
         built = summary.build(
@@ -187,6 +200,7 @@ def _in_process(
 
 
 def _over_topics(
+    start: launcher.Start,
     settings: Settings,
     run_id: str,
     folder: Path,
@@ -216,7 +230,8 @@ def _over_topics(
         progress.receive(record)
 
     failure = None
-    with launcher.Processes(progress.say, interrupts.again) as processes:
+    asked = interrupts.again
+    with launcher.Processes(progress.say, asked, start_program=start) as processes:
         try:
             # The watcher first: what the nodes say from their start on is to be heard.
             with Watcher(receive, f'/run_{run_id}') as watcher:

@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO, Protocol
 
 from codetr_ros.config import Settings
 from codetr_ros.processes import middleware
@@ -136,12 +137,50 @@ def end_with_parent(number: signal.Signals = signal.SIGINT) -> Callable[[], None
     return call
 
 
+class Process(Protocol):
+    """What is asked of a process that was started: a part of `subprocess.Popen`."""
+
+    @property
+    def pid(self) -> int:
+        """Its number."""
+
+    def poll(self) -> int | None:
+        """Exit code (negative: the signal that ended it), None while it runs."""
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait until it has ended; its exit code."""
+
+
+Start = Callable[[Sequence[str], Mapping[str, str], BinaryIO], Process]
+"""Starts a process: of a program's path and arguments, its environment and its log."""
+
+
+def start_program(
+    arguments: Sequence[str], environment: Mapping[str, str], log: BinaryIO
+) -> Process:
+    """Start a program in a session of its own (Ctrl-C reaches only us), which ends when we do.
+
+    Raises:
+        OSError: it cannot be started.
+    """
+    return subprocess.Popen(
+        arguments,
+        stdin=subprocess.DEVNULL,
+        stdout=log,
+        stderr=subprocess.STDOUT,
+        env=dict(environment),
+        start_new_session=True,
+        # It makes one system call, looked up before: safe beside ROS's threads.
+        preexec_fn=end_with_parent(),  # noqa: PLW1509
+    )
+
+
 @dataclass
 class Node:
     """A process that was started."""
 
     command: Command
-    process: subprocess.Popen[bytes]
+    process: Process
     log: Path
     asked: bool = False  # to end, by a signal of ours
     killed: bool = False  # by us, because it did not end when asked
@@ -204,36 +243,28 @@ class Processes:
     Attributes:
         say: tells people what is being done about a process that does not end.
         hurry: whether the user has asked again; deadlines are short then.
+        start_program: starts each of them.
     """
 
     say: Callable[[str], None]
     hurry: Callable[[], bool] = lambda: False
     stop_deadline: float = STOP_DEADLINE
+    start_program: Start = start_program
     nodes: list[Node] = field(default_factory=list)
 
     def start(self, commands: Iterable[Command], logs: Path, env: Mapping[str, str]) -> None:
-        """Start processes, each in a session of its own (Ctrl-C reaches only us) with a log.
+        """Start processes, each with a log.
 
         Raises:
             LaunchError: one cannot be started; those started before it still run (see `stop`).
         """
-        prepare = end_with_parent()
         for command in commands:
             log = logs / f'{command.name}.log'
             with log.open('wb') as file:
                 file.write(f'$ {shlex.join(command.arguments)}\n'.encode())
                 file.flush()
                 try:
-                    process = subprocess.Popen(
-                        command.arguments,
-                        stdin=subprocess.DEVNULL,
-                        stdout=file,
-                        stderr=subprocess.STDOUT,
-                        env=dict(env),
-                        start_new_session=True,
-                        # It makes one system call, looked up before: safe beside ROS's threads.
-                        preexec_fn=prepare,  # noqa: PLW1509
-                    )
+                    process = self.start_program(command.arguments, env, file)
                 except OSError as error:
                     what = f'{command.name} ({command.arguments[0]})'
                     raise LaunchError(f'{what} cannot be started: {error.strerror}') from error
