@@ -3,6 +3,8 @@
 PYTHON ?= python3
 VENV := .venv
 ARGS ?=
+# tests run in as many processes as there are cores, and those of one expensive fixture in one of them
+SIDE_BY_SIDE := -n auto --maxprocesses 8 --dist loadgroup
 BENCH ?= simulator sac_updates codetr_speed nodes throughput recording_overhead bags growth memory whole_runs
 
 # A shell in which another ROS or another environment is sourced must not mix with this one: its packages would be
@@ -10,11 +12,12 @@ BENCH ?= simulator sac_updates codetr_speed nodes throughput recording_overhead 
 unexport PYTHONPATH PYTHONHOME LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE AMENT_PREFIX_PATH
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test lint format docs bench clean
+.PHONY: help setup train test coverage lint format docs bench clean
 
 help:
 	@echo "make train    set up what is missing, then learn the default task and watch it    (codetr train)"
 	@echo "make test     set up what is missing, then run all tests, lint and types included (pytest)"
+	@echo "make coverage the same tests, and what they do not reach: a table, and pages in htmlcov/"
 	@echo "make lint     lint, format and type checks alone"
 	@echo "make bench    measure how fast everything is, some three hours on a machine that does nothing else (benchmarks/)"
 	@echo "make docs     build the pages of docs/ as a site, API reference included, into site/"
@@ -36,7 +39,10 @@ train: setup
 	@$(VENV)/bin/codetr train $(ARGS)
 
 test: setup
-	@$(VENV)/bin/python -m pytest tests $(ARGS)
+	@$(VENV)/bin/python -m pytest tests $(SIDE_BY_SIDE) $(ARGS)
+
+coverage: setup
+	@$(VENV)/bin/python -m pytest tests $(SIDE_BY_SIDE) --cov --cov-report=term:skip-covered --cov-report=html $(ARGS)
 
 lint: setup
 	@$(VENV)/bin/ruff check .
@@ -55,5 +61,5 @@ bench: setup
 	@for script in $(BENCH); do echo "== benchmarks/$$script.py"; $(VENV)/bin/python benchmarks/$$script.py || exit 1; done
 
 clean:
-	rm -rf $(VENV) .venv-removed .hypothesis .mypy_cache .pytest_cache .ruff_cache MUJOCO_LOG.TXT
+	rm -rf $(VENV) .venv-removed .hypothesis .mypy_cache .pytest_cache .ruff_cache .coverage* htmlcov MUJOCO_LOG.TXT
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -15,6 +15,14 @@ ROS = importlib.util.find_spec('rclpy') is not None
 collect_ignore_glob = [] if ROS else ['ros/*', 'graph/*']
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Where tests run side by side, those that share a fixture of their module stay together."""
+    for item in items:
+        definitions = item._fixtureinfo.name2fixturedefs.values()
+        if any(definition[-1].scope == 'module' for definition in definitions):
+            item.add_marker(pytest.mark.xdist_group(item.nodeid.split('::')[0]))
+
+
 def pytest_report_header() -> str:
     return 'ROS: found' if ROS else 'ROS: rclpy is missing, tests/ros and tests/graph are left out'
 

@@ -55,8 +55,11 @@ def check_saved(folder: Path) -> None:
 
 def test_nodes_start_in_any_order_and_finish(tmp_path):
     settings = tiny()
-    installed = Nodes(settings, tmp_path / 'run', launcher.start_program)
-    with domain(), installed as nodes, Witness(nodes) as witness:
+    with (
+        domain(),
+        Nodes(settings, tmp_path / 'run', launcher.start_program) as nodes,
+        Witness(nodes) as witness,
+    ):
         for name in ('record', 'evaluate', 'sim', 'reward'):
             nodes.start(name)
             witness.until(lambda name=name: name in witness.presence)
