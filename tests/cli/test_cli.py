@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from codetr_ros import cli, config
-from codetr_ros.cli import doctor, flags, train
+from codetr_ros.cli import flags, train
 from codetr_ros.config import Settings, SettingsError
 from codetr_ros.processes import launcher
 from codetr_ros.records import ROLES
@@ -341,69 +341,6 @@ def test_the_run_over_topics_fails_with_the_log_of_the_node_that_died(
     assert said['failure'] == 'reward ended with exit code 7'
     assert said['processes']['reward-reward']['exit_code'] == 7
     assert not said['interrupted']
-
-
-def test_doctor_names_each_check_and_fails_only_if_one_does(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bad = doctor.Check('ROS', 'fail', 'not there', 'install it')
-    good = [doctor.Check('torch', 'ok', '2.0'), doctor.Check('GPU', 'warn', 'hot', 'cool it')]
-    monkeypatch.setattr(doctor, 'CHECKS', (lambda: good,))
-    assert cli.main(['doctor']) == 0
-    monkeypatch.setattr(doctor, 'CHECKS', (lambda: good, lambda: bad))
-    assert cli.main(['doctor']) == 1
-
-    lines = capsys.readouterr().out.splitlines()[-5:]
-    assert lines == [
-        'ok    torch: 2.0',
-        'warn  GPU: hot',
-        '      -> cool it',
-        'fail  ROS: not there',
-        '      -> install it',
-    ]
-
-
-@pytest.mark.parametrize(
-    ('environ', 'status'),
-    [
-        ({}, 'ok'),
-        ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_DOMAIN_ID': '7'}, 'ok'),
-        ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}, 'warn'),
-        ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}, 'fail'),
-        ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'EVERYWHERE'}, 'fail'),
-        ({'ROS_DOMAIN_ID': 'mine'}, 'fail'),
-        ({'ROS_DOMAIN_ID': '500'}, 'fail'),
-    ],
-)
-def test_doctor_judges_discovery(environ: dict[str, str], status: str) -> None:
-    check = doctor.discovery(environ)
-
-    assert check.status == status
-    assert bool(check.remedy) == (status != 'ok')
-
-
-def test_doctor_counts_what_dead_processes_left_in_shared_memory(tmp_path: Path) -> None:
-    assert doctor.leftovers(tmp_path).status == 'ok'
-    for segment in ('fastrtps_0123456789abcdef', 'fastrtps_fedcba9876543210'):
-        (tmp_path / segment).write_bytes(bytes(1_000_000))
-        (tmp_path / f'{segment}_el').touch()
-    (tmp_path / 'other').write_bytes(bytes(1000))
-
-    check = doctor.leftovers(tmp_path)
-    assert check.status == 'warn'
-    assert '4 files of dead processes' in check.found
-    assert '2.0 MB' in check.found
-    assert 'shm clean' in check.remedy
-
-    import fcntl
-
-    with (tmp_path / 'fastrtps_0123456789abcdef_el').open('rb') as alive:
-        fcntl.flock(alive, fcntl.LOCK_EX)
-        assert '2 files of dead processes' in doctor.leftovers(tmp_path).found
-
-
-def test_doctor_says_when_shared_memory_is_missing(tmp_path: Path) -> None:
-    assert doctor.shared_memory(tmp_path / 'none').status == 'warn'
 
 
 def test_settings_error_is_what_the_flags_raise() -> None:

@@ -1,82 +1,38 @@
-"""The simulator's records against what they must add up to, and the policies that it refuses."""
-
-import dataclasses
+"""The simulator's records against what they must add up to."""
 
 import gymnasium
 import numpy as np
 import pytest
-import torch
 
 from codetr_ros import records
-from codetr_ros.config import Settings, SettingsError
+from codetr_ros.config import SettingsError
 from codetr_ros.cores.simulator import Simulator
 from codetr_ros.policy.acting import ActingPolicy
-from codetr_ros.policy.actor import Actor, describe, weights_bytes
 from codetr_ros.records import (
     MESSAGE_BYTES,
     CompositeReward,
     EpisodeResult,
     Metrics,
-    Policy,
-    RecordError,
     TaskSpec,
     Transitions,
     TrueRewards,
 )
-from codetr_ros.seeding import generator, seed_torch
+from codetr_ros.seeding import generator
 from codetr_ros.simulation import tasks
 from codetr_ros.simulation.source import CHUNK_STEPS, chunk_steps
 from helpers.builders import policy, same, task_spec, tiny
 from helpers.builders import run as run_spec
-
-FALLS = 'InvertedPendulum-v5'  # within some ten steps under the random policy
-NEVER_ENDS = 'Pendulum-v1'  # 200 steps
-
-
-def permit(phase, steps=200, sources=('sim',), **changes):
-    steps = np.full(len(sources), steps, np.uint32)
-    return policy(phase=phase, version=phase - 1, sources=sources, steps=steps, **changes)
-
-
-def learnt(task, seed=0):
-    """What a learner says of a fresh policy for the task: fields of a Policy."""
-    environment = tasks.find(task)
-    sizes = {FALLS: (4, 1), NEVER_ENDS: (3, 1)}[environment.name]
-    seed_torch(seed)
-    actor = Actor(*sizes, (16, 16))
-    weights = weights_bytes(actor)
-    return {'random': False, 'network': describe(*sizes, (16, 16)), 'weights': weights}
-
-
-def slices(settings: Settings, policies, source='sim'):
-    """What a simulator yields, slice by slice, when it has the policies from the start."""
-    simulator = Simulator(run_spec(settings), settings, source)
-    for each in policies:
-        simulator.receive(each)
-    out = []
-    for records_of_slice in simulator.work():
-        if records_of_slice is None:
-            break
-        out.append(records_of_slice)
-    simulator.close()
-    return out
-
-
-def simulate(*arguments, **named):
-    return [record for each in slices(*arguments, **named) for record in each]
-
-
-def kind(kind, said):
-    return [record for record in said if type(record) is kind]
-
-
-def true_rewards(said):
-    """The environment's rewards, episode by episode."""
-    episodes = {}
-    for record in kind(TrueRewards, said):
-        assert record.first_step == len(episodes.setdefault(record.episode, []))
-        episodes[record.episode].extend(record.rewards.astype(np.float64))
-    return {number: np.array(rewards) for number, rewards in episodes.items()}
+from helpers.simulating import (
+    FALLS,
+    NEVER_ENDS,
+    deterministic,
+    kind,
+    learnt,
+    permit,
+    simulate,
+    slices,
+    true_rewards,
+)
 
 
 @pytest.fixture(scope='module')
@@ -298,11 +254,6 @@ def test_random_actions_are_uniform(lasting):
     assert abs(actions.std() - np.sqrt(1 / 3)) < 0.03
 
 
-def deterministic(said):
-    """All but the wall time, which differs from run to run."""
-    return [record for record in said if not isinstance(record, Metrics)]
-
-
 def test_the_same_seed_gives_the_same_bits(falling):
     settings, said = falling
     later = [permit(k, **learnt(FALLS)) for k in range(2, 6)]
@@ -369,73 +320,6 @@ def test_a_phase_in_which_only_others_have_steps_is_passed_over():
     assert [chunk.phase for chunk in kind(Transitions, said)] == [1]
 
 
-def several(task, envs, phases=4):
-    """Slices of a simulator with some environments: two random phases, then two learnt ones."""
-    settings = tiny(task=task, envs=envs, phase_steps=101 * envs)
-    names = settings.sources_of('sim')
-    policies = [permit(k, 101, names, **(learnt(task) if k > 1 else {})) for k in range(phases)]
-    return settings, slices(settings, policies)
-
-
-@pytest.mark.parametrize('task', [FALLS, NEVER_ENDS])
-def test_each_environment_is_the_source_that_a_simulator_of_its_name_would_be(task):
-    settings, said = several(task, 3)
-    names = settings.sources_of('sim')
-    assert names == ('sim-1', 'sim-2', 'sim-3')
-    own = settings.changed({'envs': 1, 'simulators': 3})
-    policies = [permit(k, 101, names, **(learnt(task) if k > 1 else {})) for k in range(4)]
-    for name in names:
-        expected = deterministic(simulate(own, policies, source=name))
-        records_of_it = [r for one in said for r in deterministic(one) if r.source == name]
-        assert len(records_of_it) == len(expected) > 10
-        assert all(map(same, records_of_it, expected))
-
-
-def test_environments_take_turns_in_the_order_of_their_names():
-    _, said = several(NEVER_ENDS, 3)
-    assert [spec.source for spec in said[0]] == ['sim-1', 'sim-2', 'sim-3']
-    for one in said[1:]:
-        chunks = [chunk.source for chunk in kind(Transitions, one)]
-        assert chunks == ['sim-1', 'sim-2', 'sim-3']
-    ends = [kind(Metrics, one) for one in said if kind(Metrics, one)]
-    assert [m.node for (m,) in ends] == ['sim'] * 4  # one for each phase, of all environments
-
-
-def test_an_environment_without_steps_in_a_phase_is_passed_over():
-    settings = tiny(task=NEVER_ENDS, envs=3)
-    names = settings.sources_of('sim')
-    some = policy(sources=names, steps=np.array([1, 0, 2], np.uint32))
-    said = simulate(settings, [some, permit(1, 1, names)])
-    chunks = [(c.phase, c.source, c.sequence, c.steps) for c in kind(Transitions, said)]
-    assert chunks == [
-        *((0, 'sim-1', 0, 1), (0, 'sim-3', 0, 2)),
-        *((1, 'sim-1', 1, 1), (1, 'sim-2', 0, 1), (1, 'sim-3', 1, 1)),
-    ]
-    assert [m.phase for m in kind(Metrics, said)] == [0, 1]
-
-
-def test_a_policy_that_leaves_out_an_environment_is_refused():
-    settings = tiny(task=NEVER_ENDS, envs=2)
-    simulator = Simulator(run_spec(settings), settings, 'sim_2')
-    names = ('sim-1', 'sim-2', 'sim_2-1', 'robot')
-    with pytest.raises(RecordError, match=r"not 'sim_2-2': start the run with simulators=3"):
-        simulator.receive(permit(0, sources=names))
-    simulator.close()
-
-
-def test_counts_are_those_of_all_environments():
-    settings = tiny(task=NEVER_ENDS, envs=2)
-    simulator = Simulator(run_spec(settings), settings, 'sim')
-    names = settings.sources_of('sim')
-    simulator.receive(permit(0, 200, names))
-    for said in simulator.work():
-        if said is None:
-            break
-    simulator.close()
-    counters = simulator.report().counters
-    assert counters == {'chunks': 2, 'steps': 400, 'scores': 58, 'episodes': 2, 'phases': 1}
-
-
 def test_a_chunk_fits_into_a_message():
     for observation_size, action_size in ((3, 1), (348, 17), (6000, 60), (24_000, 1), (24_999, 1)):
         steps = chunk_steps(observation_size, action_size)
@@ -470,54 +354,6 @@ def test_a_delay_as_long_as_the_episode_gives_one_score_at_its_end():
     said = simulate(settings, [permit(k) for k in range(3)])
     scores = [(score.episode, score.length) for score in kind(CompositeReward, said)]
     assert scores == [(0, 200), (1, 200), (2, 200)]
-
-
-def changed(record: Policy, **fields):
-    return dataclasses.replace(record, **fields)
-
-
-@pytest.mark.parametrize(
-    ('wrong', 'message'),
-    [
-        (permit(1, run_id='other'), "run 'other', this is run 'run'"),
-        (permit(0), 'has run phase=0 already'),
-        (permit(2), 'has received phase=2 already'),
-        (permit(-1), 'phase=-1.*this run has phase 0 to 6'),
-        (permit(8), 'phase=8.*this run has phase 0 to 6'),
-        (permit(1, sources=('robot',)), r"sources=\['robot'\], not 'sim'"),
-        (changed(permit(1), sources=('sim', 'b')), 'steps has 1 entries for 2 sources'),
-        (permit(1, **learnt(FALLS)), "cannot act in task 'Pendulum-v1'.*another architecture"),
-        (permit(1, **learnt(NEVER_ENDS) | {'weights': b'junk'}), 'are not safetensors'),
-        (task_spec(), 'takes policies only, not TaskSpec'),
-    ],
-)
-def test_a_policy_that_must_not_be_followed_is_refused_and_changes_nothing(wrong, message):
-    settings = tiny(task=NEVER_ENDS)
-    simulator = Simulator(run_spec(settings), settings, 'sim')
-    for each in (permit(0), permit(2)):
-        simulator.receive(each)
-    work = simulator.work()
-    said = [next(work), next(work)]  # phase 0 is one chunk
-    assert next(work) is None
-    with pytest.raises(RecordError, match=message):
-        simulator.receive(wrong)
-    simulator.receive(permit(1))
-    said += [next(work), next(work)]
-    expected = slices(settings, [permit(0), permit(1), permit(2)])
-    for ours, theirs in zip(said, expected, strict=True):
-        for a, b in zip(deterministic(ours), deterministic(theirs), strict=True):
-            assert same(a, b)
-
-
-def test_weights_that_are_not_finite_are_refused():
-    settings = tiny(task=NEVER_ENDS)
-    actor = Actor(3, 1, (16, 16))
-    with torch.no_grad():
-        actor.heads.bias[0] = float('nan')
-    weights = weights_bytes(actor)
-    simulator = Simulator(run_spec(settings), settings, 'sim')
-    with pytest.raises(RecordError, match="'heads.bias' are not finite"):
-        simulator.receive(permit(0, **learnt(NEVER_ENDS) | {'weights': weights}))
 
 
 def test_only_records_that_a_simulator_publishes_come_out(falling):

@@ -9,6 +9,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 
 from codetr_ros.bags.definitions import encode, own_types
+from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.topics import BagTopic, schema_text
 from codetr_ros.bags.writer import McapWriter
 from codetr_ros.records import (
@@ -163,3 +164,11 @@ WRITERS: dict[str, Callable[..., Path]] = {
     'mcap-lz4': by_mcap(CompressionType.LZ4),
     'mcap-without-chunks': by_mcap(CompressionType.NONE, use_chunking=False),
 }
+
+
+def messages(path, on_damage=None):
+    """Everything that a message is, for comparison."""
+    return [
+        (m.channel.topic, m.channel.type, m.log_time, m.publish_time, m.sequence, bytes(m.data))
+        for m in Bag(path, on_damage).raw()
+    ]

@@ -2,9 +2,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
-import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -12,90 +9,19 @@ import pytest
 from codetr_ros import config
 from codetr_ros.processes import launcher
 from codetr_ros.processes.launcher import Command, LaunchError, Node, Processes
-from codetr_ros.processes.supervise import Interrupts, Silence, supervise, why_it_gave_up
-from codetr_ros.records import Commit, Presence
-from codetr_ros.runs import folder as run_folder
-from codetr_ros.runs import reports
-from codetr_ros.runs.reports import NodeReport
 from helpers.executables import prefix
-
-PATIENCE = 20.0  # seconds after which a test gives up; nothing waits for it to pass
-
-
-READY = 'import signal, sys, time\n'
-
-
-ENDS_WHEN_ASKED = """
-def end(*_):
-    with open(sys.argv[1], 'a') as file:
-        print(sys.argv[2], file=file)
-    sys.exit(0)
-signal.signal(signal.SIGINT, end)
-"""
-
-
-DEAF = 'signal.signal(signal.SIGINT, signal.SIG_IGN)\n'
-
-
-WAIT = "print('ready', flush=True)\nwhile True: time.sleep(60)\n"
-
-
-class Said(list[str]):
-    """What people are told."""
-
-    def __call__(self, text: str) -> None:
-        self.append(text)
-
-
-@pytest.fixture
-def said() -> Said:
-    return Said()
-
-
-@pytest.fixture
-def processes(said: Said) -> Iterator[Processes]:
-    with Processes(said, stop_deadline=PATIENCE) as started:
-        yield started
-
-
-def python(name: str, program: str, *arguments: object, role: str | None = None) -> Command:
-    # -S -E: without site-packages a child starts in a fraction of the time.
-    call = (sys.executable, '-S', '-E', '-c', program, *map(str, arguments))
-    return Command(name, role or name, call)
-
-
-def wait_until(true: Callable[[], bool], what: str) -> None:
-    give_up = time.monotonic() + PATIENCE
-    while not true():
-        assert time.monotonic() < give_up, f'waited {PATIENCE} s for {what}'
-        threading.Event().wait(0.005)
-
-
-def start(processes: Processes, logs: Path, *commands: Command) -> None:
-    """Start them and wait until each that says so is ready for signals."""
-    processes.start(commands, logs, os.environ)
-    for node in processes.nodes:
-        if 'ready' in node.command.arguments[4]:
-            wait_until(lambda n=node: 'ready\n' in n.log.read_text(), f'{node.name} to be ready')
-
-
-def exists(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
-
-
-def poll(processes: Processes) -> Callable[[], None]:
-    """For `supervise`: hands nothing on, and fails rather than hang."""
-    give_up = time.monotonic() + PATIENCE
-
-    def look() -> None:
-        assert time.monotonic() < give_up, [node.how_it_ended() for node in processes.nodes]
-        threading.Event().wait(0.005)
-
-    return look
+from helpers.programs import (
+    DEAF,
+    ENDS_WHEN_ASKED,
+    PATIENCE,
+    READY,
+    WAIT,
+    Said,
+    exists,
+    python,
+    start,
+    wait_until,
+)
 
 
 def test_the_recorder_is_asked_to_end_after_everybody_else_has(
@@ -230,178 +156,6 @@ def test_ctrl_c_in_the_terminal_reaches_the_parent_only(
     (node,) = processes.nodes
     assert os.getpgid(node.process.pid) == node.process.pid != os.getpgid(0)
     assert os.getsid(node.process.pid) == node.process.pid
-
-
-def test_a_run_whose_processes_all_end_well_has_not_failed(
-    tmp_path: Path, processes: Processes
-) -> None:
-    start(processes, tmp_path, python('sim', ''), python('learner', ''))
-
-    failure = supervise(processes, poll(processes), Interrupts(), Silence())
-
-    assert failure is None
-
-
-@pytest.mark.parametrize(
-    ('program', 'reason'),
-    [
-        ('raise SystemExit(3)', 'learner ended with exit code 3'),
-        (
-            'import os, signal; os.kill(os.getpid(), signal.SIGKILL)',
-            'learner was ended by SIGKILL',
-        ),
-    ],
-)
-def test_a_process_that_dies_stops_the_whole_run_and_is_named(
-    tmp_path: Path, processes: Processes, said: Said, program: str, reason: str
-) -> None:
-    start(
-        processes,
-        tmp_path,
-        python('sim', READY + ENDS_WHEN_ASKED + WAIT, '/dev/null', ''),
-        python('learner', program),
-    )
-
-    failure = supervise(processes, poll(processes), Interrupts(), Silence())
-
-    assert failure == reason
-    assert said == [f'{reason}: stopping sim']
-    assert processes.running() == []
-    assert [n.name for n in processes.nodes if n.unasked_failure] == ['learner']
-
-
-def test_a_process_that_ends_well_but_too_early_stops_the_run(
-    tmp_path: Path, processes: Processes
-) -> None:
-    (tmp_path / 'nodes').mkdir()
-    tired = NodeReport(role='learner', name='learner', finished=False, error='tired')
-    reports.write(run_folder.report_path(tmp_path, 'learner', 'learner'), tired)
-    start(
-        processes,
-        tmp_path,
-        python('sim', READY + ENDS_WHEN_ASKED + WAIT, '/dev/null', ''),
-        python('learner', ''),
-    )
-
-    failure = supervise(
-        processes,
-        poll(processes),
-        Interrupts(),
-        Silence(),
-        lambda node: why_it_gave_up(node, tmp_path),
-    )
-
-    assert failure == 'learner ended before the run had finished: tired'
-    assert processes.running() == []
-
-
-def test_a_process_without_a_report_is_named(tmp_path: Path, processes: Processes) -> None:
-    start(processes, tmp_path, python('learner', ''))
-    (node,) = processes.nodes
-
-    assert why_it_gave_up(node, tmp_path) == 'learner ended without a report'
-    report = NodeReport(role='learner', name='learner', finished=True)
-    reports.write(run_folder.report_path(tmp_path, 'learner', 'learner'), report)
-    assert why_it_gave_up(node, tmp_path) is None
-
-
-def test_a_process_that_stays_when_all_else_has_ended_is_named_and_ended(
-    tmp_path: Path, processes: Processes
-) -> None:
-    now = [0.0]
-    start(
-        processes,
-        tmp_path,
-        python('sim', ''),
-        python('record', READY + ENDS_WHEN_ASKED + WAIT, '/dev/null', ''),
-    )
-    look = poll(processes)
-
-    def minutes_pass() -> None:
-        look()
-        if len(processes.running()) == 1:
-            now[0] += 60
-
-    failure = supervise(
-        processes, minutes_pass, Interrupts(), Silence(lambda: now[0]), deadline=90
-    )
-
-    assert failure == 'record did not end within 90 s after the rest of the run'
-    assert processes.running() == []
-
-
-def test_silence_is_broken_by_news_but_not_by_presence() -> None:
-    now = [0.0]
-    silence = Silence(lambda: now[0])
-    now[0] = 30
-    silence.receive(
-        Presence(
-            run_id='r',
-            role='sim',
-            node='sim',
-            instance_id='i',
-            settings_hash='',
-            finished=False,
-            topics=(),
-            published=(),
-            missed=0,
-        )
-    )  # type: ignore[arg-type]
-    assert silence.seconds == 30
-    silence.receive(
-        Commit(run_id='r', phase=0, sources=(), transitions=(), scorers=(), scores=(), dropped=())
-    )  # type: ignore[arg-type]
-    assert silence.seconds == 0
-
-
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupt_ends_all_processes_and_is_no_failure(
-    tmp_path: Path, processes: Processes, said: Said, number: signal.Signals
-) -> None:
-    before = signal.getsignal(number)
-    start(processes, tmp_path, python('sim', READY + ENDS_WHEN_ASKED + WAIT, '/dev/null', ''))
-
-    with Interrupts() as interrupts:
-        os.kill(os.getpid(), number)
-        failure = supervise(processes, poll(processes), interrupts, Silence())
-
-    assert failure is None
-    assert interrupts.count == 1
-    assert not interrupts.again()
-    assert [node.code for node in processes.nodes] == [0]
-    assert said == ['stopping: nodes end their slice and save (Ctrl-C again to hurry)']
-    assert signal.getsignal(number) == before
-
-
-@pytest.mark.parametrize(
-    ('handler', 'failure'),
-    [('sys.exit(3)', 'sim ended with exit code 3'), (None, None)],
-    ids=['fails', 'had not come so far as to handle signals'],
-)
-def test_a_process_that_ends_badly_after_an_interrupt_is_named(
-    tmp_path: Path, processes: Processes, handler: str | None, failure: str | None
-) -> None:
-    taken = 'signal.SIG_DFL' if handler is None else f'lambda *_: {handler}'
-    start(
-        processes,
-        tmp_path,
-        python('sim', READY + f'signal.signal(signal.SIGINT, {taken})\n' + WAIT),
-    )
-
-    with Interrupts() as interrupts:
-        os.kill(os.getpid(), signal.SIGINT)
-        said = supervise(processes, poll(processes), interrupts, Silence())
-
-    assert said == failure
-
-
-def test_code_that_does_not_look_is_interrupted_by_the_second_request() -> None:
-    with Interrupts() as interrupts:
-        interrupts.raising = True
-        os.kill(os.getpid(), signal.SIGINT)
-        assert interrupts.count == 1
-        with pytest.raises(KeyboardInterrupt):
-            os.kill(os.getpid(), signal.SIGINT)
 
 
 def test_what_cannot_be_started_is_named(tmp_path: Path, processes: Processes) -> None:
