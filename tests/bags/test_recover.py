@@ -102,6 +102,7 @@ def test_what_comes_twice_stays_there_twice(tmp_path):
     assert messages(tmp_path / 'new') == messages(bag)
 
 
+@pytest.mark.slow
 def test_a_missing_split_is_said_and_the_others_are_kept(tmp_path):
     bag = ours(tmp_path / 'bag', a_run(phases=40), split_bytes=32_000)
     (bag / 'bag_1.mcap').unlink()
@@ -268,6 +269,7 @@ def test_damaged_chunks_at_the_beginning_cost_no_more_than_as_much_again(tmp_pat
     assert places[-len(kept)] < 100_000 < places[-1]
 
 
+@pytest.mark.slow
 def test_a_split_that_is_no_file_costs_only_itself(tmp_path):
     bag = ours(tmp_path / 'bag', a_run(phases=40), split_bytes=32_000)
     last = Bag(bag).files[-1]
@@ -277,6 +279,7 @@ def test_a_split_that_is_no_file_costs_only_itself(tmp_path):
     assert messages(tmp_path / 'new') == messages(bag, ignored) != []
 
 
+@pytest.mark.slow
 def test_a_last_split_that_is_missing_is_a_loss(tmp_path, capsys):
     bag = ours(tmp_path / 'bag', a_run(phases=40), split_bytes=32_000)
     last = Bag(bag).files[-1]

@@ -49,6 +49,7 @@ def bad_disk(monkeypatch):
     return make
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('lost', [1, -1], ids=['amid the bag', 'at its end'])
 def test_a_split_that_the_disk_does_not_give_costs_itself_and_the_exit_code(
     lost, tmp_path, bad_disk, capsys

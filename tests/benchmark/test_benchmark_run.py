@@ -309,6 +309,7 @@ def test_ray_that_is_not_installed_is_refused_with_the_remedy(
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_nothing_but_a_run_on_ray_imports_ray() -> None:
     program = (
         'import sys\nfrom codetr_ros.benchmark import overview, ray_pool, report, run, spec\n'

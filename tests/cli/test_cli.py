@@ -289,6 +289,7 @@ def test_a_policy_that_was_learnt_on_a_gpu_is_evaluated_without_one(
     assert cli.main(['evaluate', str(folder), '--episodes', '1']) == 0
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_a_run_in_process_with_a_checkpoint_and_a_summary(tmp_path: Path) -> None:
     folder = tmp_path / 'run'
     command = [sys.executable, '-m', 'codetr_ros.cli', 'train', '--in-process', '--out', folder]

@@ -242,6 +242,7 @@ def test_what_raises_while_watching_ends_the_run_with_reports(tmp_path):
     assert list((tmp_path / 'checkpoints').glob('learner-*'))
 
 
+@pytest.mark.slow
 def test_the_oracle_learns_from_the_true_rewards_and_only_it():
     """The digest of a run with the oracle changes with the true rewards' unit, as it must."""
     digests = {

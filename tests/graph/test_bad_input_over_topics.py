@@ -18,6 +18,8 @@ from helpers.builders import policy, score, tiny, transitions
 from helpers.nodes import Nodes, Witness, domain
 from helpers.runs import finish, start, write
 
+pytestmark = pytest.mark.slow  # all of them look at one run
+
 OBSERVATION, ACTION = 9, 1  # of InvertedDoublePendulum-v5
 LATER = 1_000_000  # a sequence number that the run never reaches
 

@@ -18,6 +18,7 @@ from helpers.runs import train
 # Episodes of the pendulum end early and at any step; those of the reacher at 50. Segments of 7
 # steps fit into neither a phase of 200 steps nor an episode of 50.
 PENDULUM, REACHER = 'InvertedDoublePendulum-v5', 'Reacher-v5'
+QUICKLY = (PENDULUM, 'codetr', 'overlap')
 CASES = [
     *itertools.product((PENDULUM, REACHER), ('codetr', 'none'), ('lock-step', 'overlap')),
     # the other methods once each, on either task and at either pace
@@ -49,7 +50,10 @@ def check_same(topics: dict[str, Any], calls: dict[str, Any]) -> None:
     assert topics['policy_sha256']
 
 
-@pytest.mark.parametrize(('task', 'method', 'pace'), CASES)
+@pytest.mark.parametrize(
+    ('task', 'method', 'pace'),
+    [pytest.param(*case, marks=[pytest.mark.slow] * (case != QUICKLY)) for case in CASES],
+)
 def test_over_topics_and_in_process_end_with_the_same_weights(tmp_path, task, method, pace):
     # ircr's labels change now and then, and not when they are evaluated
     kept = 'all' if method == 'ircr' else 'first'
@@ -61,6 +65,7 @@ def test_over_topics_and_in_process_end_with_the_same_weights(tmp_path, task, me
     check_same(topics, by_calls(settings))
 
 
+@pytest.mark.slow
 def test_another_seed_pace_or_method_ends_with_other_weights():
     """What the equality above would miss if the digests were of something else."""
     changes = (
@@ -74,6 +79,7 @@ def test_another_seed_pace_or_method_ends_with_other_weights():
     assert len(digests) == len(changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('task', 'history', 'overlap'),
     [(PENDULUM, 'singleton', True), (REACHER, 'recurrent', False)],
@@ -104,6 +110,7 @@ def test_compiled_updates_are_the_same_in_another_process(tmp_path):
     check_same(topics, calls)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     'changes',
     [
@@ -126,12 +133,14 @@ def test_labels_of_several_ages_are_the_same_over_topics_and_in_process(tmp_path
         assert calls['policy_sha256'] != by_calls(tiny())['policy_sha256']
 
 
+@pytest.mark.slow
 def test_two_simulators_over_topics_equal_two_in_process(tmp_path):
     settings = tiny(simulators=2, task=REACHER)
     topics, _ = train(settings, tmp_path / 'topics')
     check_same(topics, by_calls(settings))
 
 
+@pytest.mark.slow
 def test_several_environments_of_a_simulator_over_topics_equal_those_in_process(tmp_path):
     settings = tiny(simulators=2, envs=2, overlap=True)
     topics, _ = train(settings, tmp_path / 'topics')

@@ -11,6 +11,7 @@ from helpers.builders import tiny
 from helpers.nodes import Nodes, Witness, domain
 
 
+@pytest.mark.slow
 def test_an_evaluator_that_stands_still_delays_no_phase_and_makes_up_for_it(tmp_path):
     settings = tiny()
     last = settings.phases - 1

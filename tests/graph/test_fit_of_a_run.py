@@ -4,6 +4,8 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 from helpers.builders import tiny
 from helpers.runs import DEADLINE, train
 
@@ -16,6 +18,7 @@ sys.exit(cli.main(sys.argv[1:]))
 """
 
 
+@pytest.mark.slow
 def test_folding_the_bag_of_a_run_over_topics_ends_with_its_weights_and_needs_no_ros(tmp_path):
     settings = tiny(task='Reacher-v5', overlap=True, sac__updates_per_step=0.1, evaluate_every=0)
     run, _ = train(settings, tmp_path / 'run')

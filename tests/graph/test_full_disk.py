@@ -13,6 +13,7 @@ from helpers.nodes import domain
 from helpers.runs import finish, start, until, write
 
 
+@pytest.mark.slow
 def test_the_run_ends_with_a_whole_bag_and_says_why(tmp_path):
     settings = tiny(steps=10_000_000, memory_steps=10_000, evaluate_every=0)
     with domain(), small_disk(tmp_path / 'disk', 80) as disk:

@@ -102,6 +102,7 @@ def check_labels(bag: dict[str, list[Any]], settings: Settings) -> None:
     assert first == due
 
 
+@pytest.mark.slow
 def test_the_default_run_loses_nothing_and_its_bag_holds_everything(tmp_path):
     """The default task and settings, shortened to what shows it."""
     settings = load('quick').changed({'steps': 4000})
@@ -111,6 +112,7 @@ def test_the_default_run_loses_nothing_and_its_bag_holds_everything(tmp_path):
     assert 'lost' in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('what', ['first', 'all'])
 def test_the_bag_holds_the_labels_that_the_settings_ask_for(tmp_path, what):
     settings = tiny(record_relabels=what, steps=1000, memory_steps=10_000)

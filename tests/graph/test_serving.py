@@ -33,6 +33,7 @@ def ros_domain_of_module():
         yield
 
 
+@pytest.mark.slow
 def test_a_frozen_model_labels_a_run_and_is_what_it_was_at_its_end(fitted, tmp_path):
     settings = tiny(**CHANGES | {'seed': 5})
     with Nodes(settings, tmp_path / 'run') as nodes, Witness(nodes) as witness:
@@ -52,6 +53,7 @@ def test_a_frozen_model_labels_a_run_and_is_what_it_was_at_its_end(fitted, tmp_p
     assert report['started_from']['frozen'] is True
 
 
+@pytest.mark.slow
 def test_a_model_of_another_delay_is_refused_by_the_node_naming_both(fitted, tmp_path):
     settings = tiny(**CHANGES | {'delay': 9})
     with Nodes(settings, tmp_path / 'run') as nodes:

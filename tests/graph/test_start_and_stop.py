@@ -53,6 +53,7 @@ def check_saved(folder: Path) -> None:
 # ---- starting
 
 
+@pytest.mark.slow
 def test_nodes_start_in_any_order_and_finish(tmp_path):
     settings = tiny()
     with (
@@ -229,6 +230,7 @@ def saved_by_both(folder: Path) -> bool:
     return all(checkpoints.latest(where, name) for name in ('learner', 'reward'))
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_the_whole_run_and_keeps_what_was_done(interrupted):
     folder, summary, said = interrupted
     assert summary['interrupted'] and summary['failure'] is None
@@ -243,11 +245,13 @@ def test_ctrl_c_ends_the_whole_run_and_keeps_what_was_done(interrupted):
     check_saved(folder)
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_no_process_behind(interrupted):
     folder, _, _ = interrupted
     assert processes_of(folder) == []
 
 
+@pytest.mark.slow
 def test_a_node_that_is_killed_ends_the_run_which_names_it_and_leaves_no_process(tmp_path):
     folder = tmp_path / 'run'
     command = start_installed(write(tiny(steps=ENDLESS, memory_steps=10_000), folder), folder)

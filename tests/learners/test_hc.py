@@ -345,6 +345,7 @@ def test_nothing_is_learnt_while_nothing_is_scored_and_that_is_counted() -> None
     assert hc.counters == {'updates skipped, nothing scored': 200}
 
 
+@pytest.mark.slow
 @HISTORY
 def test_a_run_needs_no_reward_node_and_its_policy_changes(history: str) -> None:
     seen = []
@@ -356,6 +357,7 @@ def test_a_run_needs_no_reward_node_and_its_policy_changes(history: str) -> None
     assert len(weights) == 4  # random ones have none; then one of each learning phase
 
 
+@pytest.mark.slow
 def test_a_policy_from_a_checkpoint_acts_as_the_run_evaluated_it(tmp_path: Path) -> None:
     """Without its place in the segment it could not act at all, with a wrong one otherwise."""
     settings = tiny(method='hc', delay=7, hc__width=8, steps=800)

@@ -60,6 +60,7 @@ def off(act: Act) -> float:
     return float(np.mean([(act(o, t) - o) ** 2 for t, o in enumerate(observations)]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('history', ['singleton', 'recurrent'])
 def test_hc_finds_the_best_action_from_scores_of_random_ones(history: str) -> None:
     settings = tiny(
@@ -98,6 +99,7 @@ def reward_of_lirpg(settings: Settings, phases: int) -> float:
     return reward
 
 
+@pytest.mark.slow
 def test_lirpg_learns_a_reward_that_teaches_the_best_action() -> None:
     """The policy sees the intrinsic reward alone: left as it was made, it teaches something else.
 

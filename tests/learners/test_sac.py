@@ -179,6 +179,7 @@ def test_log_probabilities_stay_right_where_the_squash_rounds_to_one() -> None:
     np.testing.assert_allclose(log_prob.numpy(), expected, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('terminated', 'value'), [(True, 1.0), (False, 5.0)])
 def test_a_terminal_step_is_worth_its_reward_and_a_truncated_one_all_that_would_follow(
     terminated: bool, value: float

@@ -31,6 +31,7 @@ def convert(bag, out, *more, code=0):
     assert cli.main(['convert', str(bag), '--mapping', str(mapping), '--out', str(out)]) == code
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('storage', list(StoragePlugin))
 def test_the_arms_bag_becomes_steps_a_model_and_labels(make_bag, tmp_path, capsys, storage):
     make_bag.write(tmp_path / 'arm', 12, storage=storage)

@@ -38,6 +38,7 @@ def quickly(*arguments, code=0):
     return fit(*arguments, '--gradient-steps=30', '--check-every=10', code=code)
 
 
+@pytest.mark.slow
 def test_a_bag_becomes_a_checkpoint_a_summary_and_a_report_without_ros(a_run, tmp_path):
     out = tmp_path / 'out'
     done = subprocess.run(
@@ -112,6 +113,7 @@ def test_only_steps_and_scores_are_needed(a_run, tmp_path, capsys):
     assert 'hold no true step rewards' in page
 
 
+@pytest.mark.slow
 def test_several_bags_and_simulators_are_one_body_of_data(a_run, tmp_path):
     spec = next(r for r in a_run.records if isinstance(r, TaskSpec))
     other = [replace(spec, source='sim_2')] + [
@@ -129,6 +131,7 @@ def test_several_bags_and_simulators_are_one_body_of_data(a_run, tmp_path):
     assert said['data']['scored segments'] == 2 * once['data']['scored segments']
 
 
+@pytest.mark.slow
 def test_settings_come_from_the_run_a_config_or_the_flags(a_run, tmp_path):
     own = quickly(a_run.bag, tmp_path / 'own')
     assert own['settings']['codetr'] == a_run.settings.codetr.model_dump(mode='json')
@@ -145,6 +148,7 @@ def test_settings_come_from_the_run_a_config_or_the_flags(a_run, tmp_path):
     assert short['skipped']['scores of more steps than the delay'] > 100
 
 
+@pytest.mark.slow
 def test_a_fit_goes_on_from_a_saved_model(a_run, tmp_path, capsys):
     first = quickly(a_run.bag, tmp_path / 'first', '--codetr.layers=2')
 
@@ -180,6 +184,7 @@ def test_what_cannot_be_fitted_is_refused_and_named(a_run, tmp_path, capsys):
     assert 'exists and is not empty (x)' in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_settings_of_another_version_do_not_make_the_data_worthless(a_run, tmp_path):
     records = [
         replace(r, settings='{"delay": 7, "warp": 9}') if isinstance(r, RunSpec) else r

@@ -167,6 +167,7 @@ def test_loading_a_part_of_a_bag_takes_memory_for_the_part_however_long_the_bag(
     assert peaks[1] < 1.1 * peaks[0]
 
 
+@pytest.mark.slow
 def test_the_fit_learns_and_keeps_the_weights_of_the_lowest_held_out_loss(tmp_path):
     bags, found = prepared(tmp_path, 60)
     settings = tiny(memory_steps=10_000, **{'codetr.learning_rate': 0.01})

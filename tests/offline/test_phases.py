@@ -33,6 +33,7 @@ def test_folding_the_bag_ends_with_the_weights_and_labels_of_the_run(a_run, tmp_
     assert said['changed_settings'] == {}
 
 
+@pytest.mark.slow
 def test_labels_of_what_the_learner_drew_are_made_again_from_the_bag(tmp_path):
     settings = tiny(
         steps=800,
@@ -54,6 +55,7 @@ def test_labels_of_what_the_learner_drew_are_made_again_from_the_bag(tmp_path):
     assert verify(bag).sound
 
 
+@pytest.mark.slow
 def test_topics_may_have_been_recorded_in_another_order(a_run, tmp_path):
     """As by a recorder that hears the commits before the last scores, and some steps later."""
     records = list(a_run.records)
@@ -89,6 +91,7 @@ def test_a_setting_that_the_run_did_not_have_is_said_and_teaches_something_else(
     assert said['recorded_labels']['same'] == 0
 
 
+@pytest.mark.slow
 def test_a_run_that_started_from_a_saved_model_is_folded_from_it(a_run, tmp_path):
     said = fit(a_run.bag, tmp_path / 'own')
 

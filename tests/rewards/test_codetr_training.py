@@ -31,6 +31,7 @@ pytestmark = pytest.mark.usefixtures('one_thread')
 # ---------------------------------------------------------------------------------------- training
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('kind', ['sum', 'sum_square', 'square_sum', 'max'])
 def test_sixty_four_segments_of_each_composite_type_are_learnt_by_heart(kind):
     data = memory(lengths=(128,) * 4, delay=8, kind=kind)

@@ -151,6 +151,7 @@ def test_the_losses_are_those_of_each_segments_sum_and_next_observations_in_runs
     assert said['state_loss'] == pytest.approx(np.mean(states), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_where_the_attention_sees_several_segments_credit_inside_them_is_found():
     data = memory()
     config = settings(
@@ -236,6 +237,7 @@ def test_in_windows_a_step_gets_the_output_of_the_window_that_ends_with_it():
         assert found[t] == pytest.approx(rbt.label(piece)[0, -1], rel=1e-4, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_sixty_four_segments_are_learnt_by_heart():
     data = noise(64)
     config = settings(
@@ -251,6 +253,7 @@ def test_sixty_four_segments_are_learnt_by_heart():
     assert explained(trained(Rbt(config, O, A), data, 250), data) > 0.97
 
 
+@pytest.mark.slow
 def test_a_linear_sum_of_segments_is_predicted_on_unseen_episodes():
     config = settings(delay=DELAY, codetr__learning_rate=5e-3, codetr__initialisation='gpt2')
     data = memory()

@@ -50,6 +50,7 @@ def publish_a_phase(play):
     sim.publish(score(length=5))
 
 
+@pytest.mark.slow
 def test_a_phase_that_a_node_lacks_is_fetched_from_the_recorder_and_the_loss_is_excused(
     play, tmp_path
 ):
@@ -76,6 +77,7 @@ def test_a_phase_that_a_node_lacks_is_fetched_from_the_recorder_and_the_loss_is_
     assert missed[-1] == 0
 
 
+@pytest.mark.slow
 def test_a_node_gives_up_on_what_was_lost_for_good_naming_topic_and_count(play):
     play = play(settings=settings(), roles=('learner', 'sim', 'record'))
     with process('deaf', 'peer_deadline:=7.0') as deaf:  # and nobody offers to send anything again

@@ -47,6 +47,7 @@ def test_a_recorder_commits_a_phase_and_keeps_every_byte_of_it(play, tmp_path):
     assert report['finished']
 
 
+@pytest.mark.slow
 def test_what_was_published_and_never_came_is_reported_as_lost(play, tmp_path):
     play = play()
     with process('record', f'folder:={tmp_path}', 'peer_deadline:=8.0') as node:
@@ -143,6 +144,7 @@ def test_a_node_without_a_learner_names_it_and_gives_up(ros_domain):
     assert 'Traceback' not in said
 
 
+@pytest.mark.slow
 def test_a_missing_role_is_named_with_what_starts_it(play):
     play = play(roles=('learner', 'sim'))
     with process('record', 'peer_deadline:=8.0') as node:
@@ -196,6 +198,7 @@ def test_an_unknown_parameter_stops_the_node_naming_it(ros_domain):
     assert '/r/record has no parameter dealy=50' in said
 
 
+@pytest.mark.slow
 def test_another_protocol_version_is_refused(play):
     play = play(roles=('learner',))
     spec = play.spec
@@ -239,6 +242,7 @@ def test_a_second_learner_in_the_namespace_is_refused_naming_both_runs(play):
     assert "a second run in the namespace of /r/learner_2: 'first' beside 'second'" in said
 
 
+@pytest.mark.slow
 def test_a_peer_that_stops_before_the_run_is_over_is_named(play):
     play = play()
     with process('record', 'peer_deadline:=11.0') as node:

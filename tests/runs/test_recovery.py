@@ -210,6 +210,7 @@ def test_there_is_a_row_for_each_evaluation_with_labels_and_none_without():
     assert [row['step'] for row in rows] == [200, 400]
 
 
+@pytest.mark.slow
 def test_the_oracles_labels_are_the_truth_and_nobody_learns_from_the_comparison():
     settings = tiny(method='true', task='InvertedPendulum-v5', steps=600, warmup_steps=200)
     recovery = Recovery(settings)
