@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import sys
 from collections.abc import Iterator
 
 # before anything imports rclpy
@@ -25,6 +26,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_report_header() -> str:
     return 'ROS: found' if ROS else 'ROS: rclpy is missing, tests/ros and tests/graph are left out'
+
+
+@pytest.fixture(scope='session', autouse=True)
+def _end_of_the_fork_server() -> Iterator[None]:
+    yield
+    if (forked := sys.modules.get('helpers.forked')) is not None:
+        forked.end_server()
 
 
 @pytest.fixture

@@ -47,7 +47,8 @@ def test_names_that_look_like_markup_are_shown_as_they_are(command, tmp_path, ca
 
 
 @pytest.mark.parametrize('command', ['info', 'verify', 'recover'])
-def test_the_folder_of_a_run_stands_for_its_bag(command, tmp_path, capsys):
+def test_the_folder_of_a_run_stands_for_its_bag(command, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv('COLUMNS', '300')  # however long the path is, it is not wrapped
     ours(tmp_path / 'run' / 'bag', a_run())
     (tmp_path / 'run' / 'config.yaml').touch()
     out = ['--out', str(tmp_path / 'new')] if command == 'recover' else []

@@ -4,7 +4,6 @@ What runs in them is what the executables run, with ROS, its middleware and its 
 share nothing with each other that separate processes would not: their memory is a copy.
 """
 
-import atexit
 import json
 import os
 import secrets
@@ -26,6 +25,7 @@ READ_AT_IMPORT = {'OMP_NUM_THREADS': '1'}
 """What the fork server has imported with: no child of it can have this otherwise."""
 address: str | None = None
 """Where the fork server listens: started when first needed, inherited by its children."""
+_server: subprocess.Popen[bytes] | None = None
 
 
 def start_server() -> str:
@@ -38,15 +38,21 @@ def start_server() -> str:
         env=os.environ | READ_AT_IMPORT | {'OMP_WAIT_POLICY': 'PASSIVE'},
         start_new_session=True,
     )
-    assert server.stdin and server.stdout
-
-    def end() -> None:
-        server.stdin.close()  # on which it ends, and its children with it
-        server.wait(60)
-
-    atexit.register(end)
+    assert server.stdout
     assert server.stdout.readline() == b'ready\n', 'the fork server has not started'
+    global _server  # noqa: PLW0603
+    _server = server
     return '\0' + name  # an abstract address: no file
+
+
+def end_server() -> None:
+    """End the fork server, if there is one, and its children with it."""
+    global address, _server  # noqa: PLW0603
+    if _server is not None:
+        assert _server.stdin
+        _server.stdin.close()
+        _server.wait(60)
+        address = _server = None
 
 
 class Forked:
