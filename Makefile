@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 ARGS ?=
 # tests run in as many processes as there are cores, and those of one expensive fixture in one of them
-SIDE_BY_SIDE := -n auto --maxprocesses 8 --dist loadgroup
+SIDE_BY_SIDE := -n auto --maxprocesses 8 --dist loadscope
 BENCH ?= simulator sac_updates codetr_speed nodes throughput recording_overhead bags growth memory whole_runs
 
 # A shell in which another ROS or another environment is sourced must not mix with this one: its packages would be

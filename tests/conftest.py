@@ -4,6 +4,9 @@ import importlib.util
 import os
 import sys
 from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 # before anything imports rclpy
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
@@ -16,12 +19,26 @@ ROS = importlib.util.find_spec('rclpy') is not None
 collect_ignore_glob = [] if ROS else ['ros/*', 'graph/*']
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Where tests run side by side, those that share a fixture of their module stay together."""
-    for item in items:
-        definitions = item._fixtureinfo.name2fixturedefs.values()
-        if any(definition[-1].scope == 'module' for definition in definitions):
-            item.add_marker(pytest.mark.xdist_group(item.nodeid.split('::')[0]))
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Where tests run side by side, those that share a fixture of their module stay together.
+
+    (pytest-xdist's own groups, `--dist loadgroup`, have no effect with pytest 9.2.)
+    """
+    from xdist.scheduler import LoadScopeScheduling
+
+    class BySharedFixture(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            module = nodeid.split('::', maxsplit=1)[0]
+            return module if shares_a_fixture(config.rootpath / module) else nodeid
+
+    return BySharedFixture(config, log) if config.getvalue('dist') == 'loadscope' else None
+
+
+@cache
+def shares_a_fixture(module: Path) -> bool:
+    """Whether a module makes something once for several of its tests."""
+    return "scope='module'" in module.read_text()
 
 
 def pytest_report_header() -> str:
