@@ -92,6 +92,7 @@ def test_topics_are_counted_and_runs_told_apart_by_namespace(tmp_path):
     assert bag.namespaces == ('/cell_3/run',)
 
 
+@pytest.mark.slow
 def test_splits_are_read_as_one_in_the_order_of_their_numbers(tmp_path):
     records = a_run(phases=40)
     bag = ours(tmp_path / 'bag', records, split_bytes=32_000)

@@ -391,6 +391,7 @@ def test_a_row_of_a_compressed_database_is_named_as_one(tmp_path):
     assert str(entry.place).endswith('bag.db3.zstd row 1')
 
 
+@pytest.mark.slow
 def test_a_bag_without_true_rewards_and_commits_takes_no_memory_for_each_chunk():
     """A robot's bag: nothing is to be compared with its steps."""
     source = SourceChecks('sim', None, Findings())

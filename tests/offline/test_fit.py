@@ -77,6 +77,7 @@ def test_a_bag_becomes_a_checkpoint_a_summary_and_a_report_without_ros(a_run, tm
     assert settings == config.load(str(out / 'config.yaml'))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     'method', [m for m in registry.METHODS if m not in config.IN_PROCESS_ONLY]
 )
@@ -97,6 +98,7 @@ def test_what_is_no_reward_model_is_refused(a_run, tmp_path, capsys, method):
     assert 'Choose one of --method codetr|' in said
 
 
+@pytest.mark.slow
 def test_only_steps_and_scores_are_needed(a_run, tmp_path, capsys):
     """What a robot's own software may publish: no run, no task, no commit, no true rewards."""
     bare = [r for r in a_run.records if isinstance(r, Transitions | CompositeReward)]

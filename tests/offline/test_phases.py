@@ -73,6 +73,7 @@ def test_topics_may_have_been_recorded_in_another_order(a_run, tmp_path):
     assert said['skipped'] == {}
 
 
+@pytest.mark.slow
 def test_the_last_checkpoint_holds_these_very_weights(a_run, tmp_path):
     said = fit(a_run.bag, tmp_path / 'out')
 
@@ -103,6 +104,7 @@ def test_a_run_that_started_from_a_saved_model_is_folded_from_it(a_run, tmp_path
     fit(a_run.bag, tmp_path / 'nothing', '--frozen', code=1)
 
 
+@pytest.mark.slow
 def test_a_bag_cut_after_a_commit_is_folded_up_to_there(a_run, tmp_path):
     ends = [i for i, r in enumerate(a_run.records) if isinstance(r, Commit)]
     bag = write(tmp_path / 'cut', a_run.records[: ends[2] + 1])

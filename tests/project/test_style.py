@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
     [
         ['ruff', 'check', '--no-cache', '.'],
         ['ruff', 'format', '--no-cache', '--check', '.'],
-        ['mypy'],
+        pytest.param(['mypy'], marks=pytest.mark.slow),
     ],
     ids=['lint', 'format', 'types'],
 )

@@ -120,6 +120,7 @@ def test_the_loss_is_that_of_the_subsequences_drawn_in_units_of_the_target_scale
     assert said['reward_loss'] == pytest.approx(np.mean(error**2), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_linear_step_reward_is_found_again_on_unseen_episodes_the_biased_loss_flattening_it():
     data, unseen = memory(), memory(lengths=(64, 64), seed=1)
     spread, found = {}, {}

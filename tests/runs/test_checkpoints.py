@@ -135,6 +135,7 @@ for phase in (1, 2):
 """
 
 
+@pytest.mark.slow
 def test_a_process_killed_while_saving_leaves_a_whole_checkpoint_behind(tmp_path: Path) -> None:
     run = subprocess.run(
         [sys.executable, '-c', DIES_WHILE_SAVING, tmp_path],
