@@ -130,6 +130,11 @@ def stopped(request, tmp_path_factory):
             nodes.start(name)
         witness.until(lambda: witness.committed(3))
         made = Stopped(request.param, nodes, 0)
+        witness.until(  # discovery: the run may be in phase 3 before a visitor knows all of it
+            lambda: all(
+                witness.readers(topic) >= set(roles) for topic, roles in peers.READERS.items()
+            )
+        )
         made.readers = {topic: witness.readers(topic) for topic in TOPICS.values()}
         made.parameters = {name: witness.parameters(name) for name in nodes.names}
         witness.until(lambda: all(counted(witness, name) >= 4 for name in nodes.names))
