@@ -27,7 +27,7 @@ from codetr_ros.ros.resend import LastPhases
 from codetr_ros.ros.signals import Stop
 from codetr_ros.runs import folder as run_folder
 from helpers.builders import commit, policy, score, step_rewards, task_spec, tiny, transitions
-from helpers.playing import NAMESPACE, output, process
+from helpers.playing import NAMESPACE, everybody_matched, output, process
 
 
 def settings():
@@ -181,7 +181,7 @@ def test_only_a_node_that_takes_phases_in_asks_for_them_again(play, kinds, clien
 def test_what_the_core_has_not_taken_is_not_sent_again(play, tmp_path):
     play = play()
     with process('record', f'folder:={tmp_path}') as node:
-        play.until(lambda: read_by(play, 'record'), node)
+        play.until(lambda: everybody_matched(play), node)
         sim = play.links['sim']
         heard = []
         sim.node.create_subscription(DiagnosticArray, '/diagnostics', heard.append, 10)
