@@ -12,6 +12,7 @@ import yaml
 from codetr_ros.cli import COMMANDS, main
 from codetr_ros.config import load
 from codetr_ros.records import TOPICS
+from codetr_ros.records.roles import TABLE
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted((ROOT / 'docs').rglob('*.md'))]
@@ -164,9 +165,7 @@ def ros_section(title: str) -> str:
 
 
 def test_the_nodes_and_parameters_that_pages_start_exist():
-    from codetr_ros.processes.launcher import EXECUTABLES
-
-    known = {*EXECUTABLES.values()}
+    known = {(role.package, role.executable) for role in TABLE.values()}
     settings = set(load('paper').flat())
     own = {'run_id', 'folder', 'peer_deadline', 'config', 'checkpoint', 'frozen'}
     own |= {'bag', 'bag_split_mb', 'bag_keep_free_mb'}
