@@ -131,9 +131,7 @@ def stopped(request, tmp_path_factory):
         witness.until(lambda: witness.committed(3))
         made = Stopped(request.param, nodes, 0)
         witness.until(  # discovery: the run may be in phase 3 before a visitor knows all of it
-            lambda: all(
-                witness.readers(topic) >= set(roles) for topic, roles in peers.READERS.items()
-            )
+            lambda: all(witness.readers(topic) >= set(roles) for topic, roles in readers().items())
         )
         made.readers = {topic: witness.readers(topic) for topic in TOPICS.values()}
         made.parameters = {name: witness.parameters(name) for name in nodes.names}
