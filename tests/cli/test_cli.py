@@ -270,7 +270,7 @@ def test_evaluate_refuses_what_it_cannot_evaluate(
     settings = run_folder.read_settings(other).changed({'sac.hidden': (9,)})
     run_folder.write_settings(other, settings)
     assert cli.main(['evaluate', str(other)]) == 2
-    assert 'it was saved with other settings of sac' in capsys.readouterr().err
+    assert "state of policy learner 'sac' refused: actor.body.0.weight" in capsys.readouterr().err
     assert cli.main(['evaluate', str(run_dir), '--episodes', '0']) == 2
     assert 'evaluate_episodes = 0' in capsys.readouterr().err
 

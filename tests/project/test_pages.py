@@ -1,6 +1,8 @@
 """What the pages say agrees with the program: commands, flags, parameters, topics, settings."""
 
+import contextlib
 import importlib.util
+import io
 import re
 import shlex
 from functools import cache
@@ -34,14 +36,11 @@ QUOTED = [(page, command) for page in PAGES for command in commands(page.read_te
 
 @cache
 def help_of(*command: str) -> str:
-    import contextlib
-    import io
-    import os
-
-    os.environ['COLUMNS'] = '300'
     written = io.StringIO()
-    with contextlib.redirect_stdout(written), contextlib.suppress(SystemExit):
-        main([*command, '--help'])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv('COLUMNS', '300')  # nothing is wrapped
+        with contextlib.redirect_stdout(written), contextlib.suppress(SystemExit):
+            main([*command, '--help'])
     return written.getvalue()
 
 
