@@ -30,9 +30,10 @@ help:
 	@echo "PYTHON=... chooses the interpreter (3.10 to 3.13):  make test PYTHON=python3.12"
 
 setup:
-	@command -v '$(PYTHON)' >/dev/null 2>&1 || { echo "set-up: there is no command '$(PYTHON)'. Install Python 3.10\
-	to 3.13 (Debian, Ubuntu: apt install python3 python3-venv python3-dev) or name one that you have:\
-	make test PYTHON=/path/to/python3.12" >&2; exit 1; }
+	@command -v '$(PYTHON)' >/dev/null 2>&1 || { \
+		echo "set-up: there is no command '$(PYTHON)'. Install Python 3.10 to 3.13 (Debian, Ubuntu:" \
+			"apt install python3 python3-venv python3-dev) or name one that you have:" \
+			"make test PYTHON=/path/to/python3.12" >&2; exit 1; }
 	@'$(PYTHON)' bootstrap.py
 
 train: setup
