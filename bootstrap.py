@@ -33,16 +33,17 @@ from bootstrap_checks import (
     check_python,
     check_space,
     check_venv_module,
-    explain_pip,
+    say,
+    tail,
 )
+from bootstrap_packages import PIP, UV, Packages, PackagesError
 
-PIP = 'pip==26.3'
-"""The pip that comes with Python 3.10 gives up on the requirements instead of resolving them."""
 REQUIREMENTS = (
     'requirements.txt',
     'requirements-ros.txt',
     'requirements-test.txt',
     'requirements-ray.txt',  # optional for users, but what it is for is tested
+    'requirements-docs.txt',  # the same
 )
 WITHOUT_DEPENDENCIES = 'requirements-no-deps.txt'
 PACKAGES = ('msgs', 'codetr_ros', 'sim_node', 'reward_node', 'learner_node')
@@ -51,6 +52,7 @@ FOREIGN = {
     *('PYTHONPATH', 'PYTHONHOME', 'LD_LIBRARY_PATH', '_ROS_WHEELS_BOOTSTRAP_COMPLETE'),
     *('AMENT_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'COLCON_PREFIX_PATH', 'COLCON_DEFAULTS_FILE'),
     *('ROS_DISTRO', 'CONDA_PREFIX', 'PIP_USER', 'PIP_TARGET', 'PIP_PREFIX'),
+    *('UV_PYTHON', 'UV_SYSTEM_PYTHON', 'UV_WORKING_DIR', 'UV_PROJECT'),
     *('MAKEFLAGS', 'MFLAGS', 'MAKELEVEL'),
 }
 """Variables that would let another ROS, another environment or the calling make into this one."""
@@ -102,7 +104,7 @@ class Setup:
                 (name, (self.root / name).read_bytes())
                 for name in (*REQUIREMENTS, WITHOUT_DEPENDENCIES)
             ]
-            + [('pip', PIP.encode())]
+            + [('installers', f'{PIP} {UV}'.encode())]
         )
 
     def workspace_hash(self):
@@ -143,7 +145,6 @@ class Setup:
             self.make_environment()
             state = {}
         if state.get('packages') != wanted['packages']:
-            self.save({'identity': wanted['identity'], 'busy': 'packages'})
             self.install_packages()
         state = {'identity': wanted['identity'], 'packages': wanted['packages']}
         self.save(state)
@@ -189,19 +190,25 @@ class Setup:
         if code:
             raise SetupError(f'{sys.executable} -m venv failed:\n{tail(output)}')
 
+    def renew_environment(self):
+        """Make the environment anew while its packages are being installed."""
+        self.make_environment()
+        self.mark_busy()
+
+    def mark_busy(self):
+        """Note that packages are being installed: an interruption leaves some half installed."""
+        self.save({'identity': self.identity(), 'busy': 'packages'})
+
     def install_packages(self):
-        """Stage 2. All in one call: a second one lifts setuptools over what colcon allows."""
-        say('packages: 2 GB or more the first time, which takes some minutes')
-        pip = [str(self.python), '-m', 'pip', '--disable-pip-version-check', 'install']
-        everything = [word for name in REQUIREMENTS for word in ('-r', name)]
-        bare = ['--no-deps', '-r', WITHOUT_DEPENDENCIES]
-        for arguments in ([PIP], everything, bare):
-            code, output = self.call('packages', pip + arguments)
-            if code:
-                if code > 0:
-                    # pip ended by itself and put everything back; else it was killed half-way
-                    self.save({'identity': self.identity()})
-                raise SetupError(f'{tail(output)}\n\nset-up: {explain_pip(output)}')
+        """Stage 2."""
+        say('packages: 2 GB or more the first time')
+        self.mark_busy()
+        try:
+            Packages(self, REQUIREMENTS, WITHOUT_DEPENDENCIES).install()
+        except PackagesError as error:
+            if error.restored:
+                self.save({'identity': self.identity()})
+            raise
 
     def build_workspace(self):
         """Stage 3."""
@@ -252,8 +259,14 @@ class Setup:
         """File that holds everything a stage printed."""
         return self.venv / f'setup-{stage}.log'
 
-    def call(self, stage, command):
+    def call(self, stage, command, variables=None, secret=False):
         """Run a command in the project folder with nothing foreign in its environment.
+
+        Args:
+            stage: names the log that everything printed goes to.
+            command: words of the command line.
+            variables: more of them for its environment.
+            secret: whether what it prints may hold passwords: it is neither shown nor kept.
 
         Returns:
             exit code (negative: killed by that signal) and what was printed, also in `log(stage)`.
@@ -269,6 +282,7 @@ class Setup:
                     self.venv / 'colcon'
                 ),  # not the user's: it may change what colcon does
             )
+        environment.update(variables or {})
         lines = []
         process = subprocess.Popen(
             command,
@@ -283,10 +297,11 @@ class Setup:
         with process:
             for line in process.stdout:
                 lines.append(line)
-                show(line)
+                if not secret:
+                    show(line)
         show('')
         output = ''.join(lines)
-        if self.venv.is_dir():
+        if self.venv.is_dir() and not secret:
             self.log(stage).write_text(f'$ {" ".join(command)}\n{output}', errors='replace')
         return process.returncode, output
 
@@ -313,7 +328,10 @@ def mend_cmake_files(share, headers, site):
             after,
         )
         if after != before:
-            path.write_text(after)
+            # a new file: the old one is also a name of that in uv's cache, for all environments
+            mended = path.with_suffix('.mended')
+            mended.write_text(after)
+            mended.replace(path)
             changed += 1
     return changed
 
@@ -325,16 +343,6 @@ def digest(found):
         total.update(f'{name}\0{len(content)}\0'.encode())
         total.update(content)
     return total.hexdigest()
-
-
-def tail(output, lines=15):
-    """The last lines of what a command printed."""
-    return '\n'.join(output.rstrip().splitlines()[-lines:])
-
-
-def say(message):
-    """Tell the user what happens."""
-    print(f'set-up: {message}', flush=True)
 
 
 def show(line):

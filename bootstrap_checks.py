@@ -103,13 +103,13 @@ def check_compilers(search=None, include=None):
         )
 
 
-def explain_pip(output):
-    """Say why pip failed and what to do, from what it printed."""
-    if re.search(r'No space left on device|Errno 28|Errno 122', output):
+def machine_fault(output):
+    """Say what of the machine stopped pip or uv, and the remedy; None where nothing of it did."""
+    if is_full(output):
         return (
-            'the disk is full: either that of the project or that of temporary files. '
-            'Free some space, or put temporary files elsewhere: '
-            'TMPDIR=/path/on/a/larger/disk make test'
+            'the disk is full: that of the project, of temporary files or of downloaded packages. '
+            'Free some space, or put the last two elsewhere: '
+            'TMPDIR=/path/on/a/larger/disk UV_CACHE_DIR=/path/on/a/larger/disk make test'
         )
     if re.search(
         r'NewConnectionError|NameResolutionError|ConnectTimeout|ReadTimeout|ProxyError|timed out'
@@ -126,12 +126,39 @@ def explain_pip(output):
             'the package index shows a certificate that is not trusted here. '
             'Name the certificates to trust: PIP_CERT=/path/to/certificates.pem'
         )
+    return None
+
+
+def is_full(output):
+    """Whether pip or uv stopped because a disk is full or a quota is used up."""
+    return bool(re.search(r'No space left on device|Disk quota exceeded|Errno (28|122)\b', output))
+
+
+def explain_pip(output):
+    """Say why pip failed and what to do, from what it printed."""
     missing = re.search(r'No matching distribution found for (\S+)', output)
-    if missing:
-        return (
-            f'the package index has no {missing.group(1)} for this Python and machine '
-            f'({sysconfig.get_platform()}). The ROS wheels exist for x86-64 with glibc '
-            '2.28 or newer; if that is what you have, check which index pip uses: '
-            'python3 -m pip config list'
-        )
-    return 'pip failed. Its last lines are above.'
+    return (
+        machine_fault(output)
+        or (missing and unknown_package(missing.group(1)))
+        or 'pip failed. Its last lines are above.'
+    )
+
+
+def unknown_package(requirement):
+    """Say that no index has what is required, and what to do."""
+    return (
+        f'the package index has no {requirement} for this Python and machine '
+        f'({sysconfig.get_platform()}). The ROS wheels exist for x86-64 with glibc '
+        '2.28 or newer; if that is what you have, check which index pip uses: '
+        'python3 -m pip config list'
+    )
+
+
+def tail(output, lines=15):
+    """The last lines of what a command printed."""
+    return '\n'.join(output.rstrip().splitlines()[-lines:])
+
+
+def say(message):
+    """Print what happens now."""
+    print(f'set-up: {message}', flush=True)

@@ -1,6 +1,7 @@
 """The set-up: what it takes for done, what it does again, what it changes in the wheels."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -10,44 +11,9 @@ import pytest
 import bootstrap
 from bootstrap import Setup, mend_cmake_files
 from bootstrap_checks import SetupError
+from helpers.set_up import EVERYTHING, Recorded
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-class Recorded(Setup):
-    """A set-up that runs nothing but says which commands it would have run."""
-
-    def __init__(self, root: Path, fail: str = '', code: int = 1):
-        super().__init__(root)
-        self.fail, self.code = fail, code
-        self.stages: list[str] = []
-
-    def call(self, stage: str, command: list[str]) -> tuple[int, str]:
-        self.stages.append(stage)
-        if stage == 'environment':
-            self.site.mkdir(parents=True)
-            self.python.parent.mkdir()
-            self.python.touch()
-            (self.venv / 'pyvenv.cfg').touch()
-            (self.python.parent / 'pip').write_text(f'#!{self.python}\n')
-        if stage == 'workspace':
-            target = self.venv / 'lib' / 'codetr_ros' / 'codetr'
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.touch()
-        return (self.code, 'it broke') if stage == self.fail else (0, '')
-
-
-EVERYTHING = ['environment', 'packages', 'packages', 'packages', 'workspace', 'check']
-
-
-@pytest.fixture
-def root(tmp_path: Path) -> Path:
-    """A project folder with requirements and one message."""
-    for name in (*bootstrap.REQUIREMENTS, bootstrap.WITHOUT_DEPENDENCIES):
-        (tmp_path / name).write_text('numpy==2.2.6\n')
-    (tmp_path / 'msgs' / 'msg').mkdir(parents=True)
-    (tmp_path / 'msgs' / 'msg' / 'Step.msg').write_text('uint32 step\n')
-    return tmp_path
 
 
 def stages(root: Path) -> list[str]:
@@ -88,7 +54,7 @@ def test_an_interrupted_installation_is_begun_again_from_nothing(root: Path):
     interrupted = Recorded(root, fail='packages', code=-9)
     with pytest.raises(SetupError):
         interrupted.run()
-    (interrupted.site / 'half').touch()
+    assert (interrupted.site / 'half').exists()
     assert stages(root) == EVERYTHING
     assert not (interrupted.site / 'half').exists()
 
@@ -109,7 +75,7 @@ def test_an_interrupted_removal_of_an_environment_is_completed(root: Path):
 
 def test_an_installation_that_failed_by_itself_is_taken_up_where_it_was(root: Path):
     with pytest.raises(SetupError, match='it broke'):
-        Recorded(root, fail='packages', code=1).run()
+        Recorded(root, fail='packages,packages by pip', code=1).run()
     assert stages(root) == EVERYTHING[1:]
 
 
@@ -183,6 +149,19 @@ def test_the_directories_of_the_wheels_builder_are_replaced_once_and_for_all(tmp
         '/v/lib/python3.11/site-packages/numpy/_core/include" kept\n'
     )
     assert mend_cmake_files(tmp_path, '/usr/include/python3.11', site) == 0
+
+
+def test_mending_an_environment_leaves_the_files_of_the_cache_as_they_are(tmp_path: Path):
+    cached = tmp_path / 'cache' / 'x.cmake'
+    cached.parent.mkdir()
+    cached.write_text('include "/opt/python/cp311-cp311/include/python3.11"\n')
+    linked = tmp_path / 'share' / 'x.cmake'
+    linked.parent.mkdir()
+    os.link(cached, linked)  # as uv does
+    assert mend_cmake_files(linked.parent, '/usr/include/python3.11', Path('/v')) == 1
+    assert linked.read_text() == 'include "/usr/include/python3.11"\n'
+    assert cached.read_text() == 'include "/opt/python/cp311-cp311/include/python3.11"\n'
+    assert [path.name for path in linked.parent.iterdir()] == ['x.cmake']
 
 
 def test_a_second_set_up_waits_for_the_first_and_says_so(root: Path):
