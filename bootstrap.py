@@ -229,8 +229,11 @@ class Setup:
         colcon += ['--merge-install', '--symlink-install', '--install-base', str(self.venv)]
         colcon += ['--build-base', str(build), '--base-paths', *PACKAGES]
         colcon += ['--cmake-args', '-DCMAKE_BUILD_TYPE=Release', '-DBUILD_TESTING=OFF']
-        colcon += [f'-DPython3_EXECUTABLE={self.python}']
-        code, output = self.call('workspace', colcon)
+        # there are no wheels of rclcpp, so that nothing here could use the messages from C++
+        colcon += [f'-DPython3_EXECUTABLE={self.python}', '-DCODETR_MSGS_PYTHON_ONLY=ON']
+        # else colcon has make wait while the load is high, as it still is after stage 2
+        jobs = {'MAKEFLAGS': f'-j{len(os.sched_getaffinity(0))}'}
+        code, output = self.call('workspace', colcon, jobs)
         if code:
             raise SetupError(
                 f'{tail(output, 40)}\n\nset-up: the workspace does not build (its whole output: '
