@@ -1,10 +1,15 @@
+from pathlib import Path
+from xml.etree import ElementTree
+
 from setuptools import find_packages, setup
 
 package_name = 'learner_node'
+# the one place of the version: ROS tools read it there and nowhere else
+version = ElementTree.parse(Path(__file__).resolve().parent / 'package.xml').findtext('version')
 
 setup(
     name=package_name,
-    version='0.1.0',
+    version=version,
     description='Learns a policy from inferred step rewards and permits the phases of a run.',
     maintainer='The codetr_ros maintainers',
     maintainer_email='maintainers@codetr-ros.example',

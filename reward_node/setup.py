@@ -1,10 +1,15 @@
+from pathlib import Path
+from xml.etree import ElementTree
+
 from setuptools import find_packages, setup
 
 package_name = 'reward_node'
+# the one place of the version: ROS tools read it there and nowhere else
+version = ElementTree.parse(Path(__file__).resolve().parent / 'package.xml').findtext('version')
 
 setup(
     name=package_name,
-    version='0.1.0',
+    version=version,
     description='Learns from composite rewards how much each step contributed.',
     maintainer='The codetr_ros maintainers',
     maintainer_email='maintainers@codetr-ros.example',

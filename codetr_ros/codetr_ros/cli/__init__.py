@@ -24,7 +24,7 @@ commands:
   tasks      list the tasks that have a name
   doctor     check Python, ROS, discovery, shared memory, torch and MuJoCo
 
-`codetr COMMAND --help` explains the options of a command.
+`codetr COMMAND --help` explains the options of a command; `codetr --version` prints the version.
 """
 
 
@@ -109,6 +109,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Asked for, it is the output; not asked for, it is the complaint.
         print(HELP, end='', file=sys.stdout if given else sys.stderr)
         return 0 if given else USAGE
+    if given[0] == '--version':
+        from codetr_ros.system.versions import version_of
+
+        print(f'codetr {version_of("codetr_ros") or "of unknown version: it is not installed"}')
+        return 0
     command = COMMANDS.get(given[0])
     if command is None:
         return refuse(f'there is no command {given[0]!r}: commands are {", ".join(COMMANDS)}')

@@ -63,8 +63,9 @@ def executable(role: str, environ: Mapping[str, str] = os.environ) -> Path:
             return path
     raise LaunchError(
         f'the node executable {package}/{name} is in none of {", ".join(dict.fromkeys(prefixes))} '
-        f'(as lib/{package}/{name}): build the workspace (`make build`, or `colcon build` and '
-        '`. install/setup.bash`), or train without nodes with --in-process'
+        f'(as lib/{package}/{name}). Nodes need ROS 2 and the built workspace: `make setup` '
+        'brings both (on a ROS installation, `colcon build` and `. install/setup.bash`), '
+        'or train without nodes with --in-process'
     )
 
 

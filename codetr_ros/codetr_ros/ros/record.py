@@ -19,8 +19,17 @@ def load() -> 'MakeCore':
 def main(argv: list[str] | None = None) -> int:
     """Entry point; the imports follow the signal handlers, since they take a while."""
     stop = Stop().install()
-    from codetr_ros.ros.node import run_node
-    from codetr_ros.ros.recording import Recording
+    try:
+        from codetr_ros.ros.node import run_node
+        from codetr_ros.ros.recording import Recording
+    except ModuleNotFoundError as error:
+        # this command is the one of all nodes that an installation without ROS has too
+        print(
+            f'record: a node needs ROS 2 and the built workspace, but {error.name} cannot be '
+            'imported. `codetr doctor` says what is missing',
+            file=sys.stderr,
+        )
+        return 2
 
     return run_node('record', 'record', load, argv, stop, Recording)
 
