@@ -7,7 +7,15 @@ import pytest
 
 from codetr_ros.bags import causal as causal_module
 from codetr_ros.bags.causal import causal
-from codetr_ros.bags.playback import Item, Pace, Playback, PlaybackReport, PlayError, items, survey
+from codetr_ros.bags.playback import (
+    Item,
+    Pace,
+    Playback,
+    PlaybackReport,
+    PlayError,
+    items,
+    recorded_run,
+)
 from codetr_ros.bags.reader import Bag
 from codetr_ros.records import (
     Commit,
@@ -297,7 +305,7 @@ def test_after_somebody_was_waited_for_the_pace_goes_on_from_there():
 
 def test_a_survey_says_what_run_a_bag_holds(tmp_path):
     bag = Bag(ours(tmp_path / 'bag', a_run()))
-    found = survey(bag)
+    found = recorded_run(bag)
     assert (found.run.run_id, found.sources, found.phases) == ('run', ('sim',), 3)
     assert found.settings == SETTINGS
     assert found.cut() is found
@@ -327,13 +335,13 @@ def test_presence_that_another_recorder_has_recorded_is_not_played(tmp_path):
 def test_bags_that_others_wrote_are_played_too(tmp_path, writer):
     records = a_run()
     bag = Bag(WRITERS[writer](tmp_path / 'bag', records))
-    assert survey(bag).phases == 3
+    assert recorded_run(bag).phases == 3
     found = [item.record for item in items(bag, 'run')]
     assert len(found) == len(records) - 1 and all(map(same, found, records[1:]))
 
 
 def test_a_run_that_was_stopped_is_announced_with_the_steps_that_were_committed(tmp_path):
-    found = survey(Bag(ours(tmp_path / 'bag', a_run(phases=2)))).cut()
+    found = recorded_run(Bag(ours(tmp_path / 'bag', a_run(phases=2)))).cut()
     assert found.settings == SETTINGS.changed({'steps': 40})
     assert found.run.settings_hash == found.settings.hash()
     assert found.run.run_id == 'run'
@@ -344,22 +352,22 @@ def test_of_several_runs_one_must_be_chosen(tmp_path):
     with pytest.raises(
         PlayError, match=r'holds 2 runs to be played \(there are: run, two\): choos'
     ):
-        survey(bag)
-    assert survey(bag, 'two').run.run_id == 'two'
+        recorded_run(bag)
+    assert recorded_run(bag, 'two').run.run_id == 'two'
     with pytest.raises(PlayError, match="holds 0 runs 'three' to be played"):
-        survey(bag, 'three')
+        recorded_run(bag, 'three')
 
 
 def test_a_bag_without_a_commit_is_refused(tmp_path):
     records = [r for r in a_run() if not isinstance(r, Commit)]
     with pytest.raises(PlayError, match="no phase of run 'run' was committed"):
-        survey(Bag(ours(tmp_path / 'bag', records)))
+        recorded_run(Bag(ours(tmp_path / 'bag', records)))
 
 
 def test_settings_that_this_version_does_not_know_are_refused(tmp_path):
     spec = replace(run(SETTINGS), settings=run(SETTINGS).settings.replace('"delay"', '"dealy"'))
     with pytest.raises(PlayError, match=r"run 'run': dealy = 5: there is no such setting"):
-        survey(Bag(ours(tmp_path / 'bag', [spec, *a_run()[1:]])))
+        recorded_run(Bag(ours(tmp_path / 'bag', [spec, *a_run()[1:]])))
 
 
 def test_labels_are_played_where_their_node_is():

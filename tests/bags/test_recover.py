@@ -107,7 +107,7 @@ def test_a_missing_split_is_said_and_the_others_are_kept(tmp_path):
     bag = ours(tmp_path / 'bag', a_run(phases=40), split_bytes=32_000)
     (bag / 'bag_1.mcap').unlink()
     found = recover(bag, tmp_path / 'new')
-    assert 'lacks bag_1.mcap' in found.said[0].text
+    assert 'lacks bag_1.mcap' in found.losses[0].text
     assert any(f.kind == 'gap' for f in found.verdict.findings.named)
     assert not any(f.kind in ('file', 'metadata', 'index') for f in found.verdict.findings.named)
     assert messages(tmp_path / 'new') == messages(bag, lambda damage: None)
@@ -157,7 +157,7 @@ def test_rows_behind_a_damaged_page_of_a_database_are_kept(tmp_path):
     kept = messages(tmp_path / 'new')
     assert len(whole) - 40 < len(kept) < len(whole)
     assert [m for m in whole if m in kept] == kept and kept[-1] == whole[-1]
-    assert any('cannot be read' in damage.text for damage in found.said)
+    assert any('cannot be read' in damage.text for damage in found.losses)
     assert not found.verdict.sound
 
 
@@ -253,7 +253,7 @@ def test_a_killed_recorders_file_is_kept_but_for_its_damaged_first_chunk(tmp_pat
     flip(first[0].file, first[0].offset + 500)
     found = recover(bag, tmp_path / 'new')
     assert messages(tmp_path / 'new') == whole[lost:] and 0 < lost < 5
-    assert 'its CRC is' in found.said[0].text
+    assert 'its CRC is' in found.losses[0].text
 
 
 def test_damaged_chunks_at_the_beginning_cost_no_more_than_as_much_again(tmp_path):

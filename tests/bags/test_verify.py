@@ -171,7 +171,7 @@ FAULTS = {
     ),
     'a commit ends within a phase': (
         changed(RUN, 1, Commit, transitions=np.array([6])), 'commit',
-        "ends with transitions 6 of 'sim', the phase does with 7",
+        "ends with transitions 6 of 'sim', the phase itself with 7",
     ),
     'two runs are mixed': (
         [*RUN, *a_run(run_id='other')], 'run', "two runs are mixed in /run: 'run' and 'other'",
@@ -295,9 +295,9 @@ def test_a_message_that_is_missing_on_any_topic_is_noticed_by_the_recorders_numb
 @pytest.mark.parametrize(
     ('where', 'said'),
     [
-        ('chunk start', 'the chunk says that its messages are from'),
+        ('chunk start', 'the chunk states that its messages are from'),
         ('message index', 'the index of channel .* does not agree with its chunk'),
-        ('chunk index', 'the index has a chunk at byte .* that is not there so'),
+        ('chunk index', 'the index has a chunk at byte .* unlike the file'),
         ('summary', 'the CRC of the summary is'),
         ('library', 'the CRC of everything before is'),
     ],
@@ -323,7 +323,7 @@ def test_an_index_that_is_wrong_is_named_and_hides_nothing(where, said, tmp_path
 @pytest.mark.parametrize(
     ('old', 'new', 'said'),
     [
-        ('version: 9', 'version: 12', 'version 12, known are 1 to 9'),
+        ('version: 9', 'version: 12', 'version 12, only 1 to 9 are known'),
         ('message_count: 44', 'message_count: 45', 'counts 45 messages, there are 44'),
         ('storage_identifier: mcap', 'storage_identifier: sqlite3', 'the files are sqlite3'),
         ('/run/commits', '/run/other', '3 messages of /run/other'),

@@ -140,5 +140,5 @@ def test_a_file_that_cannot_be_cut_back_is_said_in_the_same_error(tmp_path, monk
 def test_a_disk_that_does_not_say_how_full_it_is_is_named(tmp_path):
     writer = McapWriter(tmp_path / 'bag', [TRANSITIONS], keep_free=1)
     shutil.rmtree(tmp_path / 'bag')
-    with pytest.raises(BagError, match='bag: its disk does not say what room is left: No such'):
+    with pytest.raises(BagError, match='bag: the room left on its disk is unknown: No such'):
         writer.check_room()

@@ -1,3 +1,3 @@
-"""Bags: written as MCAP with `ros2 bag`'s own layout, so that its tools, rosbags and Foxglove open
-them. No ROS needed.
+"""Bags: MCAP files in the layout of `ros2 bag`, which its tools, rosbags and Foxglove open. No ROS
+needed.
 """

@@ -1,4 +1,4 @@
-"""Messages of a run in an order that the run can have had, whatever order its topics came in."""
+"""Order the messages of a run as it can have published them, whatever order its topics came in."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -6,35 +6,36 @@ from typing import Protocol, TypeVar
 
 from codetr_ros.records import Commit, CompositeReward, Record, StepRewards, Transitions
 
-_MOST_HELD = 10_000  # as deep as the queue of another recorder: what is later has been lost
-_PERMITTING = (Transitions, CompositeReward, Commit)  # what others wait for
+_MOST_HELD = 10_000  # the depth of another recorder's queue: a message that is later is lost
+_PERMITTING = (Transitions, CompositeReward, Commit)  # records that others wait for
 
 
-class _Said(Protocol):
-    """Something that was said in a run."""
+class _Message(Protocol):
+    """A message of a run."""
 
     @property
     def record(self) -> Record:
-        """What it was."""
+        """Its record."""
 
 
-Said = TypeVar('Said', bound=_Said)
+MessageT = TypeVar('MessageT', bound=_Message)
 
 
-def causal(found: Iterable[Said], lag: int) -> Iterator[Said]:
-    """The same messages in an order that the run can have had: a commit behind all that it names,
-    its labels behind it, and steps behind the commit that they were permitted after.
+def causal(messages: Iterable[MessageT], lag: int) -> Iterator[MessageT]:
+    """The same messages in an order that the run can have had: a commit after all that it names,
+    its labels after it, and steps after the commit that permits them.
 
-    A recorder that hears topics as everybody else does (`ros2 bag record`) may have noted them in
-    any other order among each other. What never comes is waited for as long as its queue is deep.
+    A recorder that receives topics like any other subscriber (`ros2 bag record`) may have mixed
+    the order between topics. A message that never comes is waited for until as many others are
+    held as such a recorder's queue takes.
 
     Args:
-        found: messages of one run, each topic in its own order.
-        lag: phases from what is learnt from to what may be under way.
+        messages: of one run, each topic in its own order.
+        lag: phases from the one learnt from to the last that may be under way.
     """
-    held: list[Said] = []
+    held: list[MessageT] = []
     numbers: Counter[tuple[type, str]] = Counter()  # next of each publisher
-    committed = heard = -1
+    committed = seen = -1
 
     def early(record: Record) -> bool:
         if isinstance(record, Transitions):
@@ -45,14 +46,14 @@ def causal(found: Iterable[Said], lag: int) -> Iterator[Said]:
             number >= numbers[key] for key, number in named(record).items()
         )
 
-    for item in found:
-        record = item.record
-        lost = isinstance(record, Commit) and record.phase > heard + 1
+    for message in messages:
+        record = message.record
+        lost = isinstance(record, Commit) and record.phase > seen + 1
         if isinstance(record, Commit):
-            heard = max(heard, record.phase)
-        following: Said | None = item
+            seen = max(seen, record.phase)
+        following: MessageT | None = message
         if not lost and early(record):
-            held.append(item)
+            held.append(message)
             following = held.pop(0) if len(held) > _MOST_HELD else None
         permits = False
         while following is not None:
@@ -71,7 +72,7 @@ def causal(found: Iterable[Said], lag: int) -> Iterator[Said]:
 
 
 def publisher(record: Transitions | CompositeReward) -> tuple[type, str]:
-    """Who numbers such records."""
+    """The publisher that numbers such a record: the record's type and the publisher's name."""
     return type(record), record.source if isinstance(record, Transitions) else record.scorer
 
 

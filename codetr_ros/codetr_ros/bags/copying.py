@@ -1,7 +1,7 @@
-"""Messages into a new bag as the bytes that they are, with their times and numbers.
+"""Copy messages to a new bag as the bytes they are, with their times and numbers.
 
-Nothing is decoded, so nothing can change, and types that this library does not know keep the
-definitions that their bag has of them. The new bag is MCAP, whatever the old one was.
+Nothing is decoded, so nothing can change. Types that this library does not know keep the
+definitions from their bag. The new bag is MCAP, whatever the old one was.
 """
 
 import os
@@ -41,11 +41,11 @@ class _Topic:
 
     def qos(self) -> list[dict[str, Any]]:
         try:
-            said = load_yaml(self.channel.qos)
-        except (yaml.YAMLError, ValueError, RecursionError):  # of dates and numbers, too
+            profiles = load_yaml(self.channel.qos)
+        except (yaml.YAMLError, ValueError, RecursionError):  # ValueError: a bad date or number
             return []
-        listed = isinstance(said, list) and all(isinstance(one, dict) for one in said)
-        return said if listed else []
+        listed = isinstance(profiles, list) and all(isinstance(one, dict) for one in profiles)
+        return profiles if listed else []
 
 
 @dataclass
@@ -113,15 +113,15 @@ class _File:
 
 
 def copy(messages: Iterable[RawMessage], folder: Path, library: str) -> Copied:
-    """Write messages to a new bag, one file for each of theirs; `describe` makes it whole.
+    """Write messages to a new bag, one file for each source file; `describe` makes it whole.
 
     Args:
         messages: in their order.
-        folder: there, and empty.
-        library: who the files say that they are by, where their own recorder did not number them.
+        folder: exists, and is empty.
+        library: the writer that the new files name. Files numbered by our recorder name `LIBRARY`.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the bag cannot be written.
     """
     made = Copied()
     with ExitStack() as stack:
@@ -147,5 +147,5 @@ def copy(messages: Iterable[RawMessage], folder: Path, library: str) -> Copied:
 
 
 def describe(made: Copied, folder: Path) -> None:
-    """Write the metadata of a bag that was copied."""
+    """Write the metadata of a copied bag."""
     atomic_write(folder / METADATA, render(made.files, made.topics.values()))

@@ -1,9 +1,9 @@
-"""What messages look like: their definitions, which come with the library, and records from their
-bytes. No ROS needed.
+"""The definitions of our messages, which come with the library, and records from their bytes. No
+ROS needed.
 
-A bag carries the definitions of its messages. Before anything of a type is read, what the bag says
-is compared with what this version expects, field by field: bytes read by a wrong definition would
-be other numbers.
+A bag carries the definitions of its messages. Before a type is read, the bag's definition is
+compared with this version's, field by field: bytes read by a wrong definition would be other
+numbers.
 """
 
 import struct
@@ -31,7 +31,7 @@ from codetr_ros.records import Record, RecordError
 from codetr_ros.records.fields import RECORD_TYPES, record_of, type_name
 
 LONGEST_DEFINITION = 1 << 20
-"""Bytes that a definition in a bag may have, with all that it contains."""
+"""The most characters of a definition in a bag, with all that it contains."""
 
 _TEXTS = Path(__file__).parent / 'msg'  # the files of the message package itself
 _TIME = {'builtin_interfaces/msg/Time': 'int32 sec\nuint32 nanosec'}
@@ -47,8 +47,8 @@ class Definition(NamedTuple):
 
 
 def bundled_text(name: str) -> str | None:
-    """The definition of one of our types, or of one that they contain; without what it contains
-    itself. None of any other type.
+    """The definition of one of our types, or of a type that they contain, without the types that
+    it contains itself. None for any other type.
     """
     if name in RECORD_TYPES:
         return (_TEXTS / f'{RECORD_TYPES[name].__name__}.msg').read_text()
@@ -70,11 +70,11 @@ def parsed(name: str, definition: Definition) -> Typesdict:
     """The types that a bag's definition describes, the type itself among them.
 
     Raises:
-        BagError: it cannot be read.
+        BagError: the definition cannot be read.
     """
     encoding, text = definition.encoding, definition.text
     if encoding not in ('ros2msg', 'ros2idl'):
-        raise BagError(f'{name} is defined in {encoding!r}, known are ros2msg and ros2idl')
+        raise BagError(f'{name} is defined in {encoding!r}: only ros2msg and ros2idl are known')
     if len(text) > LONGEST_DEFINITION:
         raise BagError(
             f'the definition of {name} has {len(text)} characters, '
@@ -104,7 +104,7 @@ def _described(fields: Fielddefs) -> list[str]:
 
 
 def check_own(name: str, definition: Definition) -> None:
-    """Refuse a bag whose definition of one of our types is not the one that we read by.
+    """Refuse a bag whose definition of one of our types differs from ours.
 
     Raises:
         BagError: names the type, and the first field that differs.
@@ -142,30 +142,30 @@ def _difference(name: str, definition: Definition) -> str:
 
 @cache
 def _inward(record_type: type) -> tuple[tuple[str, Callable[[Any], Any]], ...]:
-    """How each field gets from a decoded message into a record: arrays become our own memory."""
+    """The conversion of each field of a decoded message for a record: arrays are copied."""
     nodes = dict(own_types().fielddefs[type_name(record_type)][1])
-    found: list[tuple[str, Callable[[Any], Any]]] = []
+    conversions: list[tuple[str, Callable[[Any], Any]]] = []
     for field in fields(record_type):
         node: Any = nodes[field.name]
         element = node[1][0][1][0] if node[0] == Nodetype.SEQUENCE else None
         if element == 'string':
-            found.append((field.name, tuple))
+            conversions.append((field.name, tuple))
         elif element == 'uint8':
-            found.append((field.name, lambda value: value.tobytes()))
+            conversions.append((field.name, lambda value: value.tobytes()))
         elif element:
-            found.append((field.name, lambda value: value.copy()))
+            conversions.append((field.name, lambda value: value.copy()))
         else:
-            found.append((field.name, lambda value: value))
-    return tuple(found)
+            conversions.append((field.name, lambda value: value))
+    return tuple(conversions)
 
 
 def decode(record_type: type, data: bytes | memoryview) -> Record:
     """The record in the CDR bytes of its message.
 
-    Takes no more memory than the bytes have, whatever lengths they claim.
+    It takes no more memory than the bytes, whatever lengths they claim.
 
     Raises:
-        RecordError: the bytes are no such message, or lengths in it disagree.
+        RecordError: the bytes are no such message, or its lengths disagree.
     """
     try:
         message = own_types().deserialize_cdr(data, type_name(record_type))
@@ -179,8 +179,8 @@ def encode(record: Record, stamp: int = 0) -> bytes:
     """The CDR bytes of a record's message.
 
     Args:
-        record: what to say.
-        stamp: when it is said [ns].
+        record: the content of the message.
+        stamp: when it is published [ns].
 
     Raises:
         RecordError: a number does not fit its field.

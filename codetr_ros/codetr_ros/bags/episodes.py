@@ -1,4 +1,4 @@
-"""The steps and scores of one source as a bag tells them, checked one after the other.
+"""Checks of the steps and scores of one source in a bag, one after the other.
 
 Memory: twelve bytes for each episode, and whatever still waits for its counterpart.
 """
@@ -23,7 +23,7 @@ from codetr_ros.records.checks import check_transitions
 
 _MOST_SKIPPED = 1_000_000  # episodes
 _MOST_EARLY = 10_000  # scores
-_MOST_AHEAD = 10_000  # chunks of which true rewards may come, where none have come yet
+_MOST_AHEAD = 10_000  # chunks kept for their true rewards while none have come yet
 _U32 = 2**32 - 1
 Span = tuple[int, int, int]
 """Episode, first step, length."""
@@ -39,7 +39,7 @@ class Numbers:
         self._findings = findings
 
     def take(self, sequence: int, place: Any) -> bool:
-        """Note a number; whether it is a new one."""
+        """Note a number and return whether it is new."""
         if sequence < self.next:
             self._findings.add(
                 'duplicate', place, f'{self.whose}: number {sequence} comes again or out of order'
@@ -55,17 +55,17 @@ class Numbers:
 
 
 def missing_numbers(first: int, last: int) -> str:
-    """`number 3 is` or `numbers 3 to 5 are`, to go on with 'missing'."""
+    """`number 3 is` or `numbers 3 to 5 are`, before the word 'missing'."""
     return f'number {first} is' if first == last else f'numbers {first} to {last} are'
 
 
 class SourceChecks:
-    """What one simulator or robot did.
+    """Checks of what one simulator or robot did.
 
     Args:
         name: its name.
-        delay: steps of a segment; None where the bag does not say.
-        findings: are added to.
+        delay: steps of a segment; None where the bag has no settings.
+        findings: where faults are added.
     """
 
     def __init__(self, name: str, delay: int | None, findings: Findings) -> None:
@@ -74,9 +74,8 @@ class SourceChecks:
         self.spec: TaskSpec | None = None
         self.numbers = Numbers(f'transitions of {name!r}', findings)
         self.committed = -1  # last sequence number that a commit has named
-        self.ends: dict[
-            int, int
-        ] = {}  # phase -> sequence number of its last chunk, until committed
+        # phase -> sequence number of its last chunk, until committed
+        self.ends: dict[int, int] = {}
         self.steps = 0
         self.scored = 0
         self._findings = findings
@@ -85,15 +84,12 @@ class SourceChecks:
         self._ended = array('B')
         self._last: tuple[int, int, bytes] | None = None  # episode, next step, its observation
         self._due: dict[Span, tuple[int, Any]] = {}  # segments without score -> sequence, place
-        self._early: list[
-            tuple[CompositeReward, Any]
-        ] = []  # scores of steps that are not here yet
-        self._chunks: OrderedDict[int, Span] = (
-            OrderedDict()
-        )  # of which the true rewards have not come
-        self._true: dict[int, tuple[Span, Any]] = {}  # true rewards whose chunk has not come
+        # scores whose steps have not come, chunks without true rewards, true rewards without chunk
+        self._early: list[tuple[CompositeReward, Any]] = []
+        self._chunks: OrderedDict[int, Span] = OrderedDict()
+        self._true: dict[int, tuple[Span, Any]] = {}
         self._has_true = False
-        self._passed = -1  # chunks up to this number: true rewards of them are not compared
+        self._passed = -1  # true rewards of chunks up to this number are not compared
 
     def transitions(self, chunk: Transitions, place: Any) -> None:
         """Check the next steps."""
@@ -130,7 +126,7 @@ class SourceChecks:
             self._findings.add('value', place, f'{describe(chunk)}: both terminated and truncated')
 
     def _follow(self, chunk: Transitions, place: Any) -> None:
-        """Whether the steps go on where the last ones ended."""
+        """Check that the steps go on where the last ones ended."""
         expected: tuple[int, int] = (0, 0) if self._last is None else self._last[:2]
         ended = chunk.terminated or chunk.truncated
         if (chunk.episode, chunk.first_step) != expected:
@@ -150,10 +146,10 @@ class SourceChecks:
         self._last = (*next_, chunk.observations[-1].tobytes())
 
     def _lengthen(self, chunk: Transitions, place: Any) -> None:
-        """Which segments ended with these steps."""
+        """Note the segments that end with these steps."""
         episode, after = chunk.episode, chunk.first_step + chunk.steps
         if episode > len(self._lengths) + _MOST_SKIPPED:
-            return  # said as a gap; a wild number must not take memory
+            return  # already reported as a gap; a wild number must not take memory
         for known in (self._lengths, self._until, self._ended):
             known.extend([0] * (episode + 1 - len(known)))
         before = self._lengths[episode]
@@ -228,12 +224,12 @@ class SourceChecks:
             self._passed = max(self._passed, last)
 
     def labelled(self, span: Span) -> bool:
-        """Whether these steps are there."""
+        """Whether the bag has these steps."""
         episode, first, length = span
         return episode < len(self._lengths) and first + length <= self._lengths[episode]
 
     def finish(self, commits: bool, place: Any) -> None:
-        """Say what never came. Of a bag with commits, only what they name counts."""
+        """Report what never came. In a bag with commits, only what they name counts."""
         for (episode, first, length), (sequence, where) in self._due.items():
             if not commits or sequence <= self.committed:
                 self._findings.add(

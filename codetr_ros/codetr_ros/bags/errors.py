@@ -11,7 +11,7 @@ class BagError(RuntimeError):
 
 
 class BagWriteError(BagError):
-    """A bag that the disk does not take: its cause is the system's error."""
+    """A bag that cannot be written to its disk; the cause is the system's error."""
 
 
 class Place(NamedTuple):
@@ -29,17 +29,17 @@ class Place(NamedTuple):
 
 
 class Damage(NamedTuple):
-    """Something that was found wrong while reading."""
+    """A fault met while reading."""
 
     place: Place
     text: str
     lost: int  # bytes that could not be read; 0 where nothing is known to be missing
-    harmless: bool = False  # no message is missing or wrong by it: only an index or a summary is
-    unread: bool = False  # the disk does not give what lies there: nobody knows what is lost by it
+    harmless: bool = False  # only an index or a summary is wrong: no message is
+    unread: bool = False  # the disk cannot be read there: what is lost is unknown
 
     def error(self) -> BagError:
-        """The same as an error, with the remedy."""
+        """The fault as an error, with the remedy."""
         return BagError(
             f'{self.place}: {self.text}. `codetr bag verify` lists all that is wrong with the '
-            'bag, `codetr bag recover` makes a whole one of what can be read'
+            'bag, `codetr bag recover` makes a whole one from what can be read'
         )

@@ -15,18 +15,18 @@ from codetr_ros.bags.metadata import METADATA
 
 STORAGES = ('.mcap', '.db3')
 COMPRESSED = '.zstd'
-"""What follows such an ending where a whole file is compressed."""
+"""The further suffix of a file that is compressed as a whole."""
 
 
 def storage_of(name: str) -> str:
-    """How a file of this name stores messages: its ending, that of a compression left out."""
+    """How a file of this name stores messages: its suffix, without that of a compression."""
     return PurePath(name.removesuffix(COMPRESSED)).suffix
 
 
 def _number(name: str) -> tuple[int, str]:
     """Splits are numbered; 10 comes after 9."""
-    found = re.search(r'_(\d+)\.[a-z0-9.]+$', name)
-    return (int(found[1]) if found else -1, name)
+    match = re.search(r'_(\d+)\.[a-z0-9.]+$', name)
+    return (int(match[1]) if match else -1, name)
 
 
 def listed_files(folder: Path) -> list[str]:
@@ -37,8 +37,8 @@ def listed_files(folder: Path) -> list[str]:
     """
     path = folder / METADATA
     try:
-        said = metadata.read(folder)['relative_file_paths']
-        return [PurePath(name).name for name in said]
+        paths = metadata.read(folder)['relative_file_paths']
+        return [PurePath(name).name for name in paths]
     except FileNotFoundError:
         return []
     except OSError as error:
@@ -54,8 +54,8 @@ def bag_files(path: Path, on_damage: Callable[[Damage], None] | None) -> list[Pa
     """The files of a bag, in order: as its metadata lists them, then by number.
 
     Raises:
-        BagError: there are none. Or one is missing, is no file or is listed twice (unless that is
-            told to `on_damage`, and the others are what there is).
+        BagError: there are none. Or one is missing, is no file or is listed twice: `on_damage`, if
+            given, receives that instead, and the others are returned.
     """
     try:
         mode = path.stat().st_mode
@@ -69,7 +69,7 @@ def bag_files(path: Path, on_damage: Callable[[Damage], None] | None) -> list[Pa
     except OSError as error:
         raise BagError(f'{path} cannot be read: {error.strerror}') from error
 
-    def tell(where: Path, error: BagError, unread: bool) -> None:
+    def report(where: Path, error: BagError, unread: bool) -> None:
         if on_damage is None:
             raise error
         on_damage(Damage(Place(where, 0), str(error), 0, unread=unread))
@@ -78,23 +78,23 @@ def bag_files(path: Path, on_damage: Callable[[Damage], None] | None) -> list[Pa
     try:
         listed = listed_files(path)
     except BagError as error:
-        tell(path / METADATA, error, False)
+        report(path / METADATA, error, False)
     for name, times in Counter(listed).items():
         if name not in there:
-            tell(path / METADATA, _lacking(path, name), True)
+            report(path / METADATA, _lacking(path, name), True)
         elif times > 1:
-            tell(path / METADATA, _listed_again(path, name, times), False)
+            report(path / METADATA, _listed_again(path, name, times), False)
     known = [name for name in dict.fromkeys(listed) if name in there]
     names = [*known, *sorted(there - set(known), key=_number)]
     if not names:
         raise BagError(f'{path} is no bag: it holds no file of {_named()}')
-    return _files(path, names, tell)
+    return _files(path, names, report)
 
 
 def _listed_again(path: Path, name: str, times: int) -> BagError:
     return BagError(
         f'{path / METADATA} lists {name} {times} times, and its messages are there once: remove '
-        'what is too much, or make a whole bag with `codetr bag recover`'
+        'the repetition, or make a whole bag with `codetr bag recover`'
     )
 
 
@@ -106,20 +106,20 @@ def _lacking(path: Path, name: str) -> BagError:
 
 
 def _files(
-    path: Path, names: list[str], tell: Callable[[Path, BagError, bool], None]
+    path: Path, names: list[str], report: Callable[[Path, BagError, bool], None]
 ) -> list[Path]:
-    """Those that are files; at least one."""
-    found: list[Path] = []
+    """Those of the names that are files; at least one."""
+    files: list[Path] = []
     for name in names:
         try:
             _check_file(path / name)
         except BagError as error:
-            if not found and name == names[-1]:
+            if not files and name == names[-1]:
                 raise
-            tell(path / name, error, True)
+            report(path / name, error, True)
         else:
-            found.append(path / name)
-    return found
+            files.append(path / name)
+    return files
 
 
 def _named() -> str:

@@ -1,4 +1,4 @@
-"""What `codetr bag verify` found: named one by one, counted in full."""
+"""The findings of `codetr bag verify`: named one by one, counted in full."""
 
 from collections import Counter
 from dataclasses import dataclass, field
@@ -18,7 +18,7 @@ class Finding(NamedTuple):
 
 @dataclass
 class Findings:
-    """All that is wrong, and what is only worth saying."""
+    """Everything that is wrong with a bag, and remarks on what is not."""
 
     named: list[Finding] = field(default_factory=list)
     counts: Counter[str] = field(default_factory=Counter)

@@ -1,4 +1,4 @@
-"""Which step rewards go into a bag that keeps the first label of each segment only."""
+"""Step rewards for a bag that keeps only the first label of each segment."""
 
 from dataclasses import replace
 
@@ -13,16 +13,16 @@ _NONE: tuple[U64, I64] = np.empty(0, np.uint64), np.empty(0, np.int64)
 
 
 class FirstLabels:
-    """What of the step rewards goes into the bag.
+    """Reduces step rewards to what goes into the bag.
 
-    Every part is kept, so that the bag has as many as were published; a part holds the segments
-    labelled for the first time, or all that it had where the phase's policy is evaluated. Segments
-    are whole the first time; later rows may be some of their steps (`relabel` 'drawn').
+    Every part is kept, so that the bag has as many as were published. A part keeps the segments
+    labelled for the first time, or all of them where the phase's policy is evaluated. Segments are
+    whole the first time; later rows may be some of their steps (`relabel` 'drawn').
 
-    Memory: 16 bytes for each segment that the reward side may hold, for each source. It evicts
-    whole episodes, oldest first, and labels nothing of them again: an episode is forgotten here
-    once the labelled steps of the newer ones of its source exceed `memory_steps`. Were it labelled
-    all the same, that would be written twice, not lost.
+    Memory: 16 bytes for each segment that the reward side may hold, for each source. The reward
+    side evicts whole episodes, oldest first, and does not label them again. An episode is
+    forgotten here once the labelled steps of the newer ones of its source exceed `memory_steps`.
+    If it were labelled after all, those labels would be written twice, not lost.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -31,7 +31,7 @@ class FirstLabels:
         self._seen: dict[str, tuple[U64, I64]] = {}
 
     def keep(self, part: StepRewards) -> StepRewards | None:
-        """The part reduced to what is kept; None if all of it is."""
+        """The part reduced to what is kept; None if all of it is kept."""
         fresh = self._note(part.source, part.episodes, part.first_steps, part.lengths)
         if fresh.all() or self._settings.evaluated(part.phase):
             return None
@@ -47,11 +47,11 @@ class FirstLabels:
     def _note(
         self, source: str, episodes: U32, first_steps: U32, lengths: U32
     ) -> NDArray[np.bool_]:
-        """Which segments are new; they, and whatever lies in them, are not from now on."""
+        """Which segments are new. From now on they, and whatever lies in them, are not."""
         given = episodes.astype(np.uint64) << _EPISODE_BITS | first_steps
         keys, steps = self._seen.get(source, _NONE)
         ends = np.concatenate([np.zeros(1, np.uint64), keys + steps.astype(np.uint64)])
-        # the end of the last segment that begins there or before: 0 where there is none
+        # the end of the last segment that begins there or before; 0 where there is none
         fresh: NDArray[np.bool_] = given >= ends[np.searchsorted(keys, given, 'right')]
         if fresh.any():
             keys = np.concatenate([keys, given[fresh]])
@@ -61,7 +61,7 @@ class FirstLabels:
         return fresh
 
     def _of_memory(self, keys: U64, steps: I64) -> tuple[U64, I64]:
-        """Without the episodes that are evicted by now."""
+        """Drop the episodes that are evicted by now."""
         episodes = keys >> _EPISODE_BITS
         upto = np.cumsum(steps)
         newer = upto[-1] - upto[np.searchsorted(episodes, episodes, 'right') - 1]

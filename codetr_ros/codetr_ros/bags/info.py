@@ -35,7 +35,7 @@ class Range:
     total: float = 0.0  # times `_SMALL`
 
     def add(self, value: float) -> None:
-        """Take a number in."""
+        """Include a number."""
         if not math.isfinite(value):
             self.not_finite += 1
             return
@@ -45,15 +45,16 @@ class Range:
         self.total += value * _SMALL
 
     def report(self) -> dict[str, float | int]:
-        """As JSON has it; only the count where there is nothing."""
-        found: dict[str, float | int] = {'count': self.count}
+        """As JSON; only the count where there are no numbers."""
+        summary: dict[str, float | int] = {'count': self.count}
         if self.count:
-            found |= {'min': self.low, 'max': self.high, 'mean': self.total / self.count / _SMALL}
-        return found | ({'not_finite': self.not_finite} if self.not_finite else {})
+            mean = self.total / self.count / _SMALL
+            summary |= {'min': self.low, 'max': self.high, 'mean': mean}
+        return summary | ({'not_finite': self.not_finite} if self.not_finite else {})
 
 
 @dataclass
-class Source:
+class SourceCounts:
     """A simulator or robot in a run."""
 
     task: str = ''
@@ -68,13 +69,13 @@ class Source:
 
 
 @dataclass
-class Run:
+class RunCounts:
     """A run in a bag: everything with one run id in one namespace."""
 
     namespace: str
     run_id: str
     settings: dict[str, Any] = field(default_factory=dict)
-    sources: dict[str, Source] = field(default_factory=dict)
+    sources: dict[str, SourceCounts] = field(default_factory=dict)
     phases: Range = field(default_factory=Range)
     scores: Range = field(default_factory=Range)
     scored_steps: int = 0
@@ -88,7 +89,7 @@ class Run:
         if isinstance(record, RunSpec):
             self._settings(record)
         elif isinstance(record, TaskSpec):
-            source = self.sources.setdefault(record.source, Source())
+            source = self.sources.setdefault(record.source, SourceCounts())
             source.task, source.horizon = record.task, record.horizon
             source.observation_size = record.observation_size
             source.action_size = record.action_size
@@ -109,14 +110,14 @@ class Run:
 
     def _settings(self, record: RunSpec) -> None:
         try:
-            said = json.loads(record.settings)
+            settings = json.loads(record.settings)
         except ValueError:
-            return  # of `verify`
-        if isinstance(said, dict):
-            self.settings = {name: _plain(said[name]) for name in SETTINGS if name in said}
+            return  # `verify` reports it
+        if isinstance(settings, dict):
+            self.settings = {name: _plain(settings[name]) for name in SETTINGS if name in settings}
 
     def _steps(self, record: Transitions) -> None:
-        source = self.sources.setdefault(record.source, Source())
+        source = self.sources.setdefault(record.source, SourceCounts())
         source.observation_size = record.observations.shape[1]
         source.action_size = record.actions.shape[1]
         source.steps += record.steps
@@ -126,7 +127,7 @@ class Run:
         source.truncated += record.truncated
 
     def report(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """As JSON."""
         return {
             'namespace': self.namespace,
             'run_id': self.run_id,
@@ -146,7 +147,7 @@ class Run:
 
 
 def _plain(value: Any) -> Any:
-    """A value of damaged settings as JSON has it: what is no number there is text."""
+    """A value of damaged settings as strict JSON, which has no NaN: such a value becomes text."""
     try:
         return json.loads(json.dumps(value, allow_nan=False))
     except ValueError:
@@ -159,7 +160,7 @@ def namespace_of(entry: Entry) -> str:
 
 
 def survey(path: Path | str) -> dict[str, Any]:
-    """What is in a bag, as JSON has it. Faults are counted, and do not end it.
+    """What is in a bag, as JSON. Faults are counted and do not end the survey.
 
     Raises:
         BagError: there is no bag there, or its messages are not those that we read.
@@ -171,11 +172,11 @@ def survey(path: Path | str) -> dict[str, Any]:
         faults += 1
 
     bag = Bag(path, damaged)
-    runs: dict[tuple[str, str], Run] = {}
+    runs: dict[tuple[str, str], RunCounts] = {}
     times = Range()
     for entry in bag.entries():
         key = namespace_of(entry), entry.record.run_id
-        runs.setdefault(key, Run(*key)).take(entry.record)
+        runs.setdefault(key, RunCounts(*key)).take(entry.record)
         times.add(entry.log_time)
     return {
         'bag': str(bag.path),

@@ -15,7 +15,7 @@ class McapChannels:
     """Channels by their number, each with the definition of its message type.
 
     Attributes:
-        library: who wrote the file, as its header has it.
+        library: the program that wrote the file, as its header names it.
     """
 
     def __init__(self) -> None:
@@ -33,10 +33,10 @@ class McapChannels:
         return self._channels.get(number)
 
     def take(self, record: Any) -> None:
-        """Take note of a schema or channel record, as of any other nothing.
+        """Note a schema or channel record, and ignore any other.
 
         Raises:
-            FaultError: it contradicts an earlier one, or its definition is not there.
+            FaultError: it contradicts an earlier one, or its definition is missing.
         """
         if isinstance(record, mcap_records.Schema):
             _keep(self._schemas, record)
@@ -45,8 +45,8 @@ class McapChannels:
             self._channels[record.id] = self._channel(record)
 
     def borrow(self, records: Iterable[Any]) -> None:
-        """Take from a summary, which repeats them, what the file has not described so far: the
-        chunk that did may be the one that is damaged.
+        """Take what the file has not described so far from a summary, which repeats all of it: the
+        chunk with the description may be the damaged one.
         """
         for record in records:
             if isinstance(record, mcap_records.Schema):

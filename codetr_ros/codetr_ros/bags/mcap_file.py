@@ -1,9 +1,9 @@
 """One MCAP file, read from front to back: every message in file order, every chunk's CRC checked,
-every length compared with what is there before anything is taken.
+every length compared with what is there before memory is taken.
 
-The libraries at hand read a whole, indexed file in order of time, or stop at the first fault. Here
-the index is not needed, so that the file of a killed recorder reads like any other, and after a
-fault reading goes on at the next chunk. The records themselves are taken apart by `mcap`.
+Other libraries read a whole, indexed file in order of time, or stop at the first fault. No index
+is needed here, so the file of a killed recorder reads like any other, and after a fault reading
+goes on at the next chunk. `mcap` parses the records themselves.
 """
 
 from collections import Counter
@@ -42,9 +42,9 @@ class McapFile:
 
     Args:
         path: the file.
-        on_damage: is told what is wrong, and reading goes on at the next chunk. By default the
-            first fault is an error.
-        shown: what it is called in places and errors, where it has been unpacked.
+        on_damage: receives each fault, and reading goes on at the next chunk. By default the first
+            fault is an error.
+        shown: the name in places and errors of a file that has been unpacked.
         thorough: compare indexes, summary and the checksums over both too.
 
     Attributes:
@@ -77,19 +77,19 @@ class McapFile:
 
     @property
     def library(self) -> str:
-        """Who wrote it, as its header has it."""
+        """The program that wrote it, as its header names it."""
         return self._described.library
 
     def channels(self) -> list[Channel]:
-        """The topics that have been met so far."""
+        """The topics met so far."""
         return self._described.all()
 
     def messages(self) -> Iterator[RawMessage]:
         """Every message, in file order.
 
         Raises:
-            BagError: the file cannot be opened, is no MCAP file, or is damaged (unless that is
-                told to `on_damage`).
+            BagError: the file cannot be opened, is no MCAP file, or is damaged: `on_damage`, if
+                given, receives that instead.
         """
         try:
             with self.path.open('rb') as file:
@@ -117,7 +117,7 @@ class McapFile:
         file.seek(0)
         at = self._begin(file, size)
         if at == size > len(MAGIC):
-            return  # the disk gives nothing of it
+            return  # the disk cannot read any of it
         ended = False
         while at < size:
             if self._faulty and not self._borrowed:
@@ -148,7 +148,7 @@ class McapFile:
         self._report(size, 'the file ends here, without its index: its writer was killed', 0)
 
     def _begin(self, file: BinaryIO, size: int) -> int:
-        """Check how the file begins; where its records do."""
+        """Check how the file begins and return where its records do."""
         try:
             magic = file.read(len(MAGIC))
         except OSError as error:
@@ -161,7 +161,7 @@ class McapFile:
     def _unread(
         self, file: BinaryIO, at: int, size: int, error: OSError, harmless: bool = False
     ) -> int:
-        """Report that the disk does not give what lies there; where to go on."""
+        """Report that the disk cannot be read there and return where to go on."""
         after = resume_at(file, at, size)
         text = f'cannot be read: {error.strerror}'
         self._report(at, text, after - at, harmless, unread=not harmless)
@@ -244,7 +244,7 @@ class McapFile:
         return RawMessage(channel, log_time, published, sequence, data, Place(self.shown, at))
 
     def _small(self, at: int, opcode: int, content: bytes) -> bool:
-        """Take note of a record that is neither message nor chunk; whether the data ends here."""
+        """Note a record that is neither message nor chunk; true if the data ends with it."""
         kind = SMALL.get(Opcode(opcode)) if opcode in Opcode.__members__.values() else None
         if kind is None:
             if opcode not in (Opcode.ATTACHMENT, *range(0x80, 0x100)):
@@ -255,20 +255,20 @@ class McapFile:
         if isinstance(record, mcap_records.Header):
             self._described.library = record.library
         elif isinstance(record, mcap_records.MessageIndex):
-            found = self._indexed.pop(record.channel_id, 0) if self._indexed is not None else None
-            if found is not None and len(record.records) != found:
+            count = self._indexed.pop(record.channel_id, 0) if self._indexed is not None else None
+            if count is not None and len(record.records) != count:
                 raise FaultError(
                     f'the index names {len(record.records)} messages of channel '
-                    f'{record.channel_id}, its chunk has {found}'
+                    f'{record.channel_id}, its chunk has {count}'
                 )
-            if self._checks is not None and found is not None:
+            if self._checks is not None and count is not None:
                 self._compare(at, self._checks.message_index(record))
         elif self._checks is not None and isinstance(record, mcap_records.DataEnd):
             self._compare(at, self._checks.data_end(record))
         return isinstance(record, mcap_records.DataEnd)
 
     def _end(self, file: BinaryIO, at: int, opcode: int, content: bytes, size: int) -> bool:
-        """Check a record of the summary; whether it is the file's last."""
+        """Check a record of the summary; true if it is the file's last."""
         if opcode == Opcode.FOOTER:
             footer = parse_record(mcap_records.Footer, content)
             self.finished = True
@@ -290,7 +290,7 @@ class McapFile:
 
 
 def _size(path: Path) -> int:
-    """Bytes of a file; 0 where nobody can know."""
+    """Bytes of a file; 0 if they cannot be known."""
     try:
         return path.stat().st_size
     except OSError:

@@ -15,8 +15,8 @@ from mcap.opcode import Opcode
 
 MAGIC = b'\x89MCAP0\r\n'
 LARGEST_RECORD = 256 << 20
-"""Bytes that a record, compressed or not, may have: what claims more is taken for damage. A reader
-holds one record and what it decompresses to."""
+"""The most bytes of a record, compressed or not: one that claims more is taken for damage. A
+reader holds one record and what it decompresses to."""
 
 HEAD = struct.Struct('<BQ')  # opcode, length of what follows
 CHUNK = struct.Struct('<QQQII')  # start, end, size, crc, length of the compression's name
@@ -100,32 +100,32 @@ def decompressed(data: memoryview, compression: str, size: int) -> bytes | memor
 
 
 def unzstd(data: bytes | memoryview, most: int) -> bytes:
-    """Unpack data piece by piece, so that it takes what it has, not what it announces.
+    """Unpack data piece by piece, so that it takes the memory it fills, not what it announces.
 
     Args:
         data: compressed.
-        most: a byte more than this is the last that is unpacked.
+        most: bytes after which unpacking stops; whatever has more gives at least one more.
 
     Raises:
         zstandard.ZstdError: it is damaged.
     """
-    found = BytesIO()
+    unpacked = BytesIO()
     with zstandard.ZstdDecompressor().stream_reader(data) as stream:
-        while found.tell() <= most and (piece := stream.read(min(_PIECE, most + 1))):
-            found.write(piece)
-    return found.getvalue()
+        while unpacked.tell() <= most and (piece := stream.read(min(_PIECE, most + 1))):
+            unpacked.write(piece)
+    return unpacked.getvalue()
 
 
 def _unlz4(data: memoryview, most: int) -> bytes:
-    found = BytesIO()
+    unpacked = BytesIO()
     stream = lz4.frame.LZ4FrameDecompressor()
     piece: bytes = stream.decompress(data, max_length=_PIECE)
     while piece:
-        found.write(piece)
-        if stream.eof or found.tell() > most:
+        unpacked.write(piece)
+        if stream.eof or unpacked.tell() > most:
             break
         piece = stream.decompress(b'', max_length=_PIECE)
-    return found.getvalue()
+    return unpacked.getvalue()
 
 
 def chunk_head(content: bytes) -> tuple[int, int, int, int, int]:
@@ -142,7 +142,7 @@ def chunk_head(content: bytes) -> tuple[int, int, int, int, int]:
         raise FaultError(f'a chunk whose compression has a name of {named} bytes')
     (length,) = struct.unpack_from('<Q', content, begin - 8)
     if begin + length != len(content):
-        raise FaultError(f'a chunk of {len(content) - begin} bytes that says it has {length}')
+        raise FaultError(f'a chunk of {len(content) - begin} bytes that states {length}')
     return start, end, size, crc, named
 
 
@@ -161,7 +161,7 @@ def resume_at(file: BinaryIO, at: int, size: int) -> int:
             return chunk
         file.seek(follows)
         opcode, length = HEAD.unpack(file.read(HEAD.size))
-    except OSError:  # of the disk: said by who asks
+    except OSError:  # of the disk: the caller reports it
         return chunk
     known = opcode in Opcode.__members__.values()
     return follows if known and follows + HEAD.size + length <= size else chunk
@@ -170,7 +170,7 @@ def resume_at(file: BinaryIO, at: int, size: int) -> int:
 def next_chunk(file: BinaryIO, at: int, size: int) -> int:
     """Where the next chunk begins whose lengths agree; the file's size if there is none.
 
-    What the disk does not give is passed over, at doubling distances: each try may take seconds.
+    Where the disk cannot be read, it skips ahead by doubling distances: each try may take seconds.
     """
     length, skip = _PIECE, _SECTOR
     while at < size:
@@ -179,13 +179,13 @@ def next_chunk(file: BinaryIO, at: int, size: int) -> int:
             view = file.read(length + _LONGEST_START - 1)
         except OSError:
             if length > _SECTOR:
-                length = _SECTOR  # perhaps only the end of so much
+                length = _SECTOR  # perhaps only the end of the piece is unreadable
             else:
                 at, skip = at + skip, 2 * skip
             continue
-        found = _chunk_in(view, length, size - at)
-        if found is not None:
-            return at + found
+        offset = _chunk_in(view, length, size - at)
+        if offset is not None:
+            return at + offset
         at += length
         length, skip = min(2 * length, _PIECE), _SECTOR
     return size
@@ -194,13 +194,13 @@ def next_chunk(file: BinaryIO, at: int, size: int) -> int:
 def _chunk_in(view: bytes, length: int, left: int) -> int | None:
     """Where in the first `length` bytes a chunk begins that ends within those that are left."""
     at = 0
-    while (match := _CHUNK_START.search(view, at)) and (found := match.start()) < length:
-        _, size = HEAD.unpack_from(view, found)
-        (named,) = struct.unpack_from('<I', view, found + HEAD.size + CHUNK.size - 4)
-        (data,) = struct.unpack_from('<Q', view, found + HEAD.size + CHUNK.size + named)
-        if size == CHUNK.size + named + 8 + data and found + HEAD.size + size <= left:
-            return found
-        at = found + 1
+    while (match := _CHUNK_START.search(view, at)) and (start := match.start()) < length:
+        _, size = HEAD.unpack_from(view, start)
+        (named,) = struct.unpack_from('<I', view, start + HEAD.size + CHUNK.size - 4)
+        (data,) = struct.unpack_from('<Q', view, start + HEAD.size + CHUNK.size + named)
+        if size == CHUNK.size + named + 8 + data and start + HEAD.size + size <= left:
+            return start
+        at = start + 1
     return None
 
 
@@ -214,7 +214,7 @@ def chunk_data(content: bytes, named: int, size: int, crc: int) -> bytes | memor
         crc: of these bytes; 0 where the writer made none.
 
     Raises:
-        FaultError: they cannot be decompressed, or their CRC is another.
+        FaultError: they cannot be decompressed, or their CRC differs.
     """
     name = bytes(content[CHUNK.size : CHUNK.size + named])
     data = memoryview(content)[CHUNK.size + named + 8 :]
@@ -239,7 +239,7 @@ def next_record(file: BinaryIO, left: int) -> tuple[bytes, int, bytes]:
     opcode, length = HEAD.unpack(head)
     left -= HEAD.size
     if not opcode:
-        raise FaultError('a record of kind 0, which there is not')
+        raise FaultError('a record of kind 0, which does not exist')
     if length > left:
         raise FaultError(f'a record of {length} bytes where {left} are left')
     if length > LARGEST_RECORD:
@@ -259,10 +259,10 @@ def message_head(content: bytes) -> tuple[int, int, int, int]:
 
 
 def summary_records(file: BinaryIO, size: int) -> list[Any]:
-    """The summary's schemas and channels; none unless its checksum says that it is as written."""
+    """The summary's schemas and channels; none unless its checksum is there and right."""
     try:
         return _summary_records(file, size)
-    except OSError:  # of the disk: said by who reads that far
+    except OSError:  # of the disk: reported where the file is read that far
         return []
 
 
@@ -282,11 +282,11 @@ def _summary_records(file: BinaryIO, size: int) -> list[Any]:
     summary = file.read(end - start)
     if not crc or zlib.crc32(footer[: HEAD.size + 16], zlib.crc32(summary)) != crc:
         return []
-    found, at = [], 0
+    records, at = [], 0
     while at + HEAD.size <= len(summary):
         opcode, length = HEAD.unpack_from(summary, at)
         content = summary[at + HEAD.size : at + HEAD.size + length]
         at += HEAD.size + length
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            found.append(parse_record(SUMMARY[Opcode(opcode)], content))
-    return found
+            records.append(parse_record(SUMMARY[Opcode(opcode)], content))
+    return records

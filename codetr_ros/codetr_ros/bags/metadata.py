@@ -1,4 +1,4 @@
-"""`metadata.yaml`: what rosbag2 wants to know of a bag before it opens a file of it."""
+"""`metadata.yaml`: what rosbag2 reads about a bag before it opens any of its files."""
 
 import os
 from collections import Counter
@@ -11,25 +11,24 @@ import yaml
 
 METADATA = 'metadata.yaml'
 VERSION = 9
-"""Of the file's layout, as rosbag2 of Jazzy writes it."""
+"""Version of the file's layout, as rosbag2 of Jazzy writes it."""
 LONGEST = 16 << 20
-"""Bytes that the file may have."""
-
+"""The most bytes of the file."""
 
 _LOADER: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)  # the same in C, ten times as fast
 
 
 def load_yaml(text: bytes | str) -> Any:
-    """Read YAML that a bag has.
+    """Read YAML from a bag.
 
     Raises:
-        yaml.YAMLError: it is none.
+        yaml.YAMLError: the text is not YAML.
     """
     return yaml.load(text, _LOADER)
 
 
 def read(folder: Path) -> Any:
-    """What the metadata of a bag says.
+    """The content of a bag's metadata.
 
     Raises:
         OSError: it cannot be read, or there is none.
@@ -42,8 +41,8 @@ def read(folder: Path) -> Any:
     return load_yaml(path.read_bytes())['rosbag2_bagfile_information']
 
 
-class Topic(Protocol):
-    """A topic as it is to be described."""
+class DescribedTopic(Protocol):
+    """A topic as the metadata describes it."""
 
     @property
     def name(self) -> str:
@@ -81,7 +80,7 @@ class BagFile:
         self.counts[topic] += 1
 
 
-def render(files: Sequence[BagFile], topics: Iterable[Topic]) -> str:
+def render(files: Sequence[BagFile], topics: Iterable[DescribedTopic]) -> str:
     """The text of `metadata.yaml`.
 
     Args:
@@ -130,13 +129,13 @@ def render(files: Sequence[BagFile], topics: Iterable[Topic]) -> str:
 
 
 def check(
-    folder: Path, found: Mapping[str, tuple[str, int]], files: Mapping[str, int]
+    folder: Path, topics: Mapping[str, tuple[str, int]], files: Mapping[str, int]
 ) -> Iterator[str]:
-    """What a bag's `metadata.yaml` says that is not so.
+    """Compare a bag's `metadata.yaml` with the bag.
 
     Args:
         folder: the bag.
-        found: type and number of messages of each topic.
+        topics: type and number of messages of each topic that was read.
         files: messages in each file, by its name.
 
     Yields:
@@ -147,7 +146,7 @@ def check(
         yield f'{METADATA} is missing: `ros2 bag` does not open the bag without it'
         return
     try:
-        yield from _contradictions(read(folder), found, files)
+        yield from _contradictions(read(folder), topics, files)
     except (
         OSError,
         yaml.YAMLError,
@@ -161,34 +160,35 @@ def check(
 
 
 def _contradictions(
-    said: Mapping[str, Any], found: Mapping[str, tuple[str, int]], files: Mapping[str, int]
+    content: Mapping[str, Any], topics: Mapping[str, tuple[str, int]], files: Mapping[str, int]
 ) -> Iterator[str]:
-    if not 1 <= int(said['version']) <= VERSION:
-        yield f'{METADATA} is of version {said["version"]}, known are 1 to {VERSION}'
-    storage = {'mcap': '.mcap', 'sqlite3': '.db3'}.get(said['storage_identifier'])
+    if not 1 <= int(content['version']) <= VERSION:
+        yield f'{METADATA} is of version {content["version"]}, only 1 to {VERSION} are known'
+    storage = {'mcap': '.mcap', 'sqlite3': '.db3'}.get(content['storage_identifier'])
     if not storage or not all(storage in name for name in files):
-        yield f'{METADATA} says that the files are {said["storage_identifier"]}'
-    listed = [PurePath(name).name for name in said['relative_file_paths']]
+        yield f'{METADATA} states that the files are {content["storage_identifier"]}'
+    listed = [PurePath(name).name for name in content['relative_file_paths']]
     for name in files.keys() - set(listed):
         yield f'{METADATA} does not list {name}'
     total = sum(files.values())
-    if said['message_count'] != total:
-        yield f'{METADATA} counts {said["message_count"]} messages, there are {total}'
-    for file in said.get('files') or ():
+    if content['message_count'] != total:
+        yield f'{METADATA} counts {content["message_count"]} messages, there are {total}'
+    for file in content.get('files') or ():
         name = PurePath(file['path']).name
         if name in files and file['message_count'] != files[name]:
             yield (
                 f'{METADATA} counts {file["message_count"]} messages in {name}, there are '
                 f'{files[name]}'
             )
-    topics = {}
-    for topic in said['topics_with_message_count']:
+    described = {}
+    for topic in content['topics_with_message_count']:
         kind = topic['topic_metadata']['type']
-        topics[topic['topic_metadata']['name']] = kind, topic['message_count']
-    for name in sorted(topics.keys() | found.keys()):
-        there, told = found.get(name, ('', 0)), topics.get(name, ('', 0))
-        if there[1] != told[1] or (there[0] and told[0] and there[0] != told[0]):
+        described[topic['topic_metadata']['name']] = kind, topic['message_count']
+    for name in sorted(described.keys() | topics.keys()):
+        kind, count = topics.get(name, ('', 0))
+        stated_kind, stated_count = described.get(name, ('', 0))
+        if count != stated_count or (kind and stated_kind and kind != stated_kind):
             yield (
-                f'{METADATA} has {told[1]} messages of {name} ({told[0] or "no type"}), there are '
-                f'{there[1]} ({there[0] or "no type"})'
+                f'{METADATA} has {stated_count} messages of {name} ({stated_kind or "no type"}), '
+                f'there are {count} ({kind or "no type"})'
             )

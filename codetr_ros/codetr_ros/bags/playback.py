@@ -1,9 +1,9 @@
-"""What of a bag is published when: in the bag's order, and never ahead of what the run permitted.
+"""When to publish each message of a bag: in its order, and never ahead of what the run permitted.
 
-In a run the learner permits phase k when it has learnt from phase k - lag, and that bounds what is
-under way. Played back, a phase goes out when everybody who learns from it has said `Metrics` of
-phase k - lag: so nothing overruns them, and they take in and learn the same as in the run, in the
-same order. No ROS needed.
+In a run the learner permits phase k once it has learnt from phase k - lag, which bounds what is
+under way. In playback, phase k goes out once every role that learns from it has published its
+`Metrics` of phase k - lag. So nothing overruns these roles, and they receive and learn the same as
+in the run, in the same order. No ROS needed.
 """
 
 import time
@@ -34,11 +34,11 @@ from codetr_ros.records import (
 from codetr_ros.runs.reports import CoreReport
 
 BATCH = 64
-"""Messages that are given out at a time, at most."""
+"""The most messages in a slice."""
 
 
 class PlayError(RuntimeError):
-    """A bag that cannot be played: names it, the reason and the remedy."""
+    """A bag that cannot be played: names the bag, the reason and the remedy."""
 
 
 class Item(NamedTuple):
@@ -50,11 +50,11 @@ class Item(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Recorded:
-    """What a bag has of a run.
+class RecordedRun:
+    """A run in a bag.
 
     Attributes:
-        run: what it was announced as.
+        run: its announcement.
         settings: its settings.
         sources: names of its sources.
         phases: how many were committed; the run may have been meant to have more.
@@ -65,20 +65,20 @@ class Recorded:
     sources: tuple[str, ...]
     phases: int
 
-    def cut(self) -> 'Recorded':
-        """The same, announced with as many steps as were committed: who learns from it then
-        finishes with it.
+    def cut(self) -> 'RecordedRun':
+        """The same run, announced with as many steps as were committed, so that the nodes which
+        learn from it finish with it.
         """
         steps = min(self.settings.steps, self.phases * self.settings.phase_steps)
         if steps == self.settings.steps:
             return self
         settings = self.settings.changed({'steps': steps})
         run = settings.run_spec(self.run.run_id)
-        return Recorded(run, settings, self.sources, self.phases)
+        return RecordedRun(run, settings, self.sources, self.phases)
 
 
-def survey(bag: Bag, run_id: str | None = None) -> Recorded:
-    """Read through a bag to know what run it holds.
+def recorded_run(bag: Bag, run_id: str | None = None) -> RecordedRun:
+    """Read through a bag for the run that it holds.
 
     Args:
         bag: the bag.
@@ -109,7 +109,7 @@ def survey(bag: Bag, run_id: str | None = None) -> Recorded:
     run = runs[wanted[0]]
     if not phases[run.run_id]:
         raise PlayError(
-            f'{bag.path}: no phase of run {run.run_id!r} was committed, so that nobody has learnt '
+            f'{bag.path}: no phase of run {run.run_id!r} was committed, and nothing was learnt '
             'from it: play another bag'
         )
     try:
@@ -117,12 +117,12 @@ def survey(bag: Bag, run_id: str | None = None) -> Recorded:
     except SettingsError as error:
         raise PlayError(str(error)) from None
     names = tuple(sorted(sources.get(run.run_id, ())))
-    return Recorded(run, settings, names, phases[run.run_id])
+    return RecordedRun(run, settings, names, phases[run.run_id])
 
 
 def items(bag: Bag, run_id: str) -> Iterator[Item]:
-    """The messages of a run, in the bag's order. Its announcement and the words of presence, which
-    others may have recorded, are not among them: they are said anew.
+    """The messages of a run, in the bag's order. Its announcement and presence, which another
+    recorder may have kept, are left out: playback publishes its own.
 
     Raises:
         BagError: the bag is damaged.
@@ -157,7 +157,7 @@ class Pace:
         return now - began >= (log_time - recorded) / 1e9 / self._rate
 
     def restart(self) -> None:
-        """Go on from the next message: somebody had to be waited for."""
+        """Start again from the next message, after a wait for a role."""
         self._first = None
 
 
@@ -168,14 +168,14 @@ class PlaybackReport(CoreReport):
 
 
 class Playback:
-    """Gives out the messages of a run, in slices, as fast as those who learn from them can follow.
+    """Yields the messages of a run, in slices, as fast as the roles that learn from them follow.
 
     Args:
-        found: the messages of the run, in the bag's order.
+        messages: of the run, in the bag's order.
         phases: how many to play.
-        lag: phases from what is learnt from to what may be under way.
-        learners: roles that are waited for. Where there are any, what belongs to no phase that is
-            played is left out.
+        lag: phases from the one learnt from to the last that may be under way.
+        learners: roles to wait for. If there are any, messages that belong to no phase that is
+            played are left out.
         pace: when a message is due at the earliest; None: at once.
     """
 
@@ -184,38 +184,38 @@ class Playback:
 
     def __init__(
         self,
-        found: Iterable[Item],
+        messages: Iterable[Item],
         phases: int,
         lag: int,
         learners: Collection[str],
         pace: Pace | None = None,
     ) -> None:
-        self._found = causal(found, lag)
+        self._messages = causal(messages, lag)
         self._phases = phases
         self._lag = lag
         self._pace = pace
         self._handled = dict.fromkeys(learners, -1)
         self._due: Counter[tuple[type, str]] = Counter()  # next sequence number of each publisher
         self._waiting = ''
-        self.phase = -1  # the last whose commit was given out
+        self.phase = -1  # the last whose commit was yielded
         self.counters: Counter[str] = Counter()
         self.duplicated: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
         self.finished = False
 
     def receive(self, record: Record) -> None:
-        """Take note that a phase was handled."""
+        """Note that a role has handled a phase."""
         if isinstance(record, Metrics) and record.role in self._handled:
             self._handled[record.role] = max(self._handled[record.role], record.phase)
 
     def work(self) -> Iterator[list[Item] | None]:
-        """A slice is a few messages; None while somebody or the time is waited for.
+        """Slices of a few messages; None while waiting for a role or for the time.
 
         Raises:
-            PlayError: something that belongs to a phase is not in the bag.
+            PlayError: the bag lacks something that belongs to a phase.
         """
         batch: list[Item] = []
-        for item in self._found:
+        for item in self._messages:
             if not self._wanted(item.record):
                 continue
             while (reason := self._held_back(item)) is not None:
@@ -275,14 +275,14 @@ class Playback:
 
     def _surplus(self, record: Record) -> bool:
         if isinstance(record, Policy) and not record.steps.any():
-            return False  # it says that all phases have been permitted
+            return False  # it announces that all phases have been permitted
         if isinstance(record, (Policy, Transitions, TrueRewards, Commit, StepRewards)):
             return record.phase >= self._phases
-        # it says of no phase that it belongs to it: the commit does
+        # a score does not name its phase: the commit does
         return isinstance(record, CompositeReward) and self.phase == self._phases - 1
 
     def _check(self, commit: Commit) -> None:
-        """Refuse a commit of which something has not been played."""
+        """Refuse a commit that names something not played."""
         for key, number in named(commit).items():
             if number >= self._due[key]:
                 self._lacks(key, number)
@@ -290,20 +290,20 @@ class Playback:
     def _lacks(self, key: tuple[type, str], last: int) -> None:
         raise PlayError(
             f'{TOPICS[key[0]]} {self._due[key]} to {last} of {key[1]!r} are not in the bag, after '
-            f'phase {self.phase} was played: `codetr bag verify` says what else is missing'
+            f'phase {self.phase} was played: `codetr bag verify` lists what else is missing'
         )
 
     def done(self, role: str) -> bool:
-        """Whether a role has learnt from everything that is played, as far as it is waited for."""
+        """Whether a role has learnt from all that is played; true of roles not waited for."""
         return self._handled.get(role, self._phases) >= self._phases - 1
 
     def waiting_for(self) -> str:
-        """What the next message waits for, for people."""
+        """What the next message waits for, in words."""
         return self._waiting
 
     def close(self) -> None:
         """Nothing to save."""
 
     def report(self) -> PlaybackReport:
-        """Counts for people."""
+        """The counts so far."""
         return PlaybackReport(counters=dict(self.counters), phases=self.phase + 1)

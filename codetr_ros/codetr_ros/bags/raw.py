@@ -27,7 +27,7 @@ class RawMessage(NamedTuple):
 
     channel: Channel
     log_time: int  # [ns] when it was received
-    publish_time: int  # [ns] as received where the bag does not say
+    publish_time: int  # [ns] the log time where the bag has none
     sequence: int  # as the file numbers it; 0 where it does not
     data: bytes | memoryview  # CDR; a view is valid until the next message is asked for
     place: Place

@@ -3,7 +3,7 @@
 A bag is a folder of MCAP or SQLite files, read as one, or such a file by itself. Messages are
 known by their type, whatever the namespace of their topics. What is read is what was written:
 every chunk's CRC is checked, every definition compared, and the first fault is an error, unless
-the caller asks to be told of faults and to go on (`on_damage`).
+the caller asks to receive faults and to go on (`on_damage`).
 """
 
 import tempfile
@@ -31,7 +31,7 @@ from codetr_ros.records import Record, RecordError
 from codetr_ros.records.fields import RECORD_TYPES, type_name
 
 _KINDS: dict[str, type[McapFile | SqliteFile]] = {'.mcap': McapFile, '.db3': SqliteFile}
-_ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'  # no CDR message begins so
+_ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'  # no CDR message begins with these bytes
 _UNREADABLE = (SerdeError, TypesysError, LookupError, OverflowError, RecursionError)
 
 
@@ -42,7 +42,7 @@ class Entry(NamedTuple):
     record: Record
     topic: str  # full name
     log_time: int  # [ns] when it was received
-    publish_time: int  # [ns] when it was published; as received where the bag does not say
+    publish_time: int  # [ns] when it was published; the log time where the bag has none
     place: Place
 
 
@@ -72,16 +72,16 @@ class Bag:
 
     Args:
         path: the bag's folder, or one MCAP or SQLite file (`.mcap`, `.db3`, also with `.zstd`).
-        on_damage: is told of each fault, and reading goes on behind it: for bags of killed
-            recorders. By default the first fault is an error, the missing end of a killed
-            recorder's file among them; every message before it has been given out by then.
-        thorough: compare indexes and summaries too, which nothing is read from.
+        on_damage: receives each fault, and reading goes on behind it: for bags of killed
+            recorders. By default the first fault is an error, even the missing end of a killed
+            recorder's file; every message before it has been yielded by then.
+        thorough: compare indexes and summaries too, although nothing is read by them.
 
     Attributes:
         files: its files, in order.
         in_files: messages in each, by name, as far as the bag has been read.
         unchecked: chunks and messages read that carry no CRC: a bit changed in them goes unnoticed
-            where it leaves a possible message behind.
+            where the result is still a possible message.
 
     Raises:
         BagError: there is no bag there, it cannot be read, or a file of it is missing.
@@ -105,7 +105,7 @@ class Bag:
             kinds: only these; all if not given.
 
         Raises:
-            BagError: the bag is damaged, or says that one of our types is something else.
+            BagError: the bag is damaged, or defines one of our types differently.
         """
         names = None if kinds is None else {type_name(kind) for kind in kinds}
         for raw in self.raw():
@@ -118,8 +118,8 @@ class Bag:
         """Our record in a message; None if it is of another type, or damaged.
 
         Raises:
-            BagError: it is damaged (unless `on_damage` is told), or the bag says that one of our
-                types is something else.
+            BagError: it is damaged (and there is no `on_damage` to receive that), or the bag
+                defines one of our types differently.
         """
         kind = RECORD_TYPES.get(raw.channel.type)
         if kind is None:
@@ -229,10 +229,10 @@ class Bag:
 
     def _damaged(self, message: RawMessage, text: str) -> None:
         damage = Damage(message.place, f'{message.channel.topic}: {text}', len(message.data))
-        _tell(damage, self.on_damage)
+        _report(damage, self.on_damage)
 
 
-def _tell(damage: Damage, on_damage: OnDamage | None) -> None:
+def _report(damage: Damage, on_damage: OnDamage | None) -> None:
     if on_damage is None:
         raise damage.error()
     on_damage(damage)
@@ -255,10 +255,10 @@ def open_file(
         with path.open('rb') as packed:
             _write(zstandard.ZstdDecompressor().read_to_iter(packed), unpacked)
     except zstandard.ZstdError as error:
-        _tell(Damage(Place(path, 0), f'its zstd data is damaged ({error})', 0), on_damage)
+        _report(Damage(Place(path, 0), f'its zstd data is damaged ({error})', 0), on_damage)
     except OSError as error:
         text = f'cannot be read: {error.strerror}'
-        _tell(Damage(Place(path, 0), text, 0, unread=True), on_damage)
+        _report(Damage(Place(path, 0), text, 0, unread=True), on_damage)
     return _KINDS[unpacked.suffix](unpacked, on_damage, path, thorough)
 
 
@@ -289,10 +289,10 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 def _decompressed(data: bytes | memoryview) -> bytes:
-    found = unzstd(data, LARGEST_RECORD)
-    if len(found) > LARGEST_RECORD:
+    unpacked = unzstd(data, LARGEST_RECORD)
+    if len(unpacked) > LARGEST_RECORD:
         raise zstandard.ZstdError(f'more than {LARGEST_RECORD} bytes')
-    return found
+    return unpacked
 
 
 @cache

@@ -1,9 +1,9 @@
-"""Makes a whole bag of what can be read of a damaged one, or of one whose recorder was killed.
+"""Makes a whole bag from what can be read of a damaged one, or of one whose recorder was killed.
 
 Every message that can be read is kept byte for byte, in order, with its times and its number; what
 comes twice stays there twice. Nothing is altered and nothing invented: a gap stays a gap, and is
-named. A chunk whose CRC is wrong is left out as a whole, since nobody can say what in it is true.
-The new bag is MCAP, whatever the old one was.
+named. A chunk whose CRC is wrong is left out as a whole, since any byte of it may be wrong. The
+new bag is MCAP, whatever the old one was.
 """
 
 from collections import Counter
@@ -18,13 +18,13 @@ from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.unfinished import unfinished
 from codetr_ros.bags.verify import Verdict, verify
 
-SAID = 1000
+NAMED = 1000
 """Losses that are named one by one; more are only counted."""
 
 
 @dataclass
-class Recovery:
-    """What became of a bag."""
+class RecoveredBag:
+    """A recovered bag, with what was kept and what was lost."""
 
     old: Path
     new: Path
@@ -32,27 +32,27 @@ class Recovery:
     bytes: int = 0  # of the messages that were kept
     lost: int = 0  # bytes of the old bag that could not be read
     faults: int = 0
-    unread: int = 0  # of these, such that the disk does not give what was there
-    said: list[Damage] = field(default_factory=list)
+    unread: int = 0  # of these, places that the disk cannot read
+    losses: list[Damage] = field(default_factory=list)
     verdict: Verdict | None = None  # on the new bag
 
     @property
     def whole(self) -> bool:
         """Whether nothing is missing but what a killed recorder had not finished, as far as the
-        numbers of what there is and the disk can tell.
+        numbers of the messages and the disk show.
         """
         return self.verdict is not None and self.verdict.sound and not self.unread
 
     def note(self, damage: Damage) -> None:
-        """Something could not be read."""
+        """Count a fault, and keep it if it is one of the first."""
         self.faults += 1
         self.unread += damage.unread
         self.lost += damage.lost
-        if len(self.said) < SAID:
-            self.said.append(damage)
+        if len(self.losses) < NAMED:
+            self.losses.append(damage)
 
     def report(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """As JSON."""
         return {
             'old': str(self.old),
             'new': str(self.new),
@@ -63,14 +63,14 @@ class Recovery:
             'unread': self.unread,
             'bytes_lost': self.lost,
             'losses': [
-                {'place': str(d.place), 'text': d.text, 'bytes': d.lost} for d in self.said
+                {'place': str(d.place), 'text': d.text, 'bytes': d.lost} for d in self.losses
             ],
             'verdict': self.verdict.report() if self.verdict else None,
         }
 
 
-def recover(old: Path | str, new: Path | str) -> Recovery:
-    """Copy what can be read of a bag to a new one, and verify that.
+def recover(old: Path | str, new: Path | str) -> RecoveredBag:
+    """Copy what can be read of a bag to a new one, and verify the new one.
 
     Args:
         old: the damaged bag; it is not touched.
@@ -79,16 +79,16 @@ def recover(old: Path | str, new: Path | str) -> Recovery:
     Raises:
         BagError: nothing can be read, or the new bag cannot be written.
     """
-    found = Recovery(Path(old), Path(new))
-    bag = Bag(found.old, found.note)
-    with unfinished(found.new, f'recover {old} again') as folder:
+    recovered = RecoveredBag(Path(old), Path(new))
+    bag = Bag(recovered.old, recovered.note)
+    with unfinished(recovered.new, f'recover {old} again') as folder:
         copied = copy(bag.raw(), folder, f'recovered by {LIBRARY}')
-        found.messages, found.bytes = copied.messages, copied.bytes
+        recovered.messages, recovered.bytes = copied.messages, copied.bytes
         if not copied.files:
             raise BagError(
                 f'no message of {old} can be read, {new} is not made: '
-                + (found.said[0].text if found.said else 'it holds none')
+                + (recovered.losses[0].text if recovered.losses else 'it holds none')
             )
         describe(copied, folder)
-    found.verdict = verify(found.new)
-    return found
+    recovered.verdict = verify(recovered.new)
+    return recovered

@@ -1,4 +1,4 @@
-"""One run as a bag tells it, checked record by record."""
+"""Checks of one run in a bag, record by record."""
 
 import hashlib
 import json
@@ -28,14 +28,14 @@ from codetr_ros.records import (
 
 
 class RunChecks:
-    """Everything with one run id in one namespace.
+    """Checks of everything with one run id in one namespace.
 
     Args:
         namespace: of the run's topics.
         run_id: its id.
-        findings: are added to.
-        ordered: a commit comes behind all that it names, as our recorder writes it. Others write
-            what they receive, in the order in which topics happen to arrive.
+        findings: where faults are added.
+        ordered: whether a commit comes after all that it names, as our recorder writes it. Others
+            write messages in the order in which they happen to arrive.
     """
 
     def __init__(
@@ -97,12 +97,13 @@ class RunChecks:
     def _spec(self, record: RunSpec, place: Any) -> None:
         if self._run is not None:
             same = record.settings == self._run.settings
-            self._add('run', place, f'said again, with {"the same" if same else "other"} settings')
+            which = 'the same' if same else 'other'
+            self._add('run', place, f'announced again, with {which} settings')
             return
         self._run = record
-        found = hashlib.sha256(record.settings.encode()).hexdigest()
-        if found != record.settings_hash:
-            self._add('run', place, f'settings have the hash {found}, not {record.settings_hash}')
+        digest = hashlib.sha256(record.settings.encode()).hexdigest()
+        if digest != record.settings_hash:
+            self._add('run', place, f'settings have the hash {digest}, not {record.settings_hash}')
         if record.protocol_version != PROTOCOL_VERSION:
             self._add(
                 'run', place, f'protocol {record.protocol_version}, this is {PROTOCOL_VERSION}'
@@ -119,7 +120,7 @@ class RunChecks:
 
     def _task(self, record: TaskSpec, place: Any) -> None:
         source = self._source(record)
-        if source.spec is not None and _said(source.spec) != _said(record):
+        if source.spec is not None and _values(source.spec) != _values(record):
             self._add('run', place, f'{record.source!r} announces another task than before')
         source.spec = record
 
@@ -156,7 +157,7 @@ class RunChecks:
                 ends = 'none' if end is None else end
                 self._add(
                     'commit', place, f'commit of phase {record.phase} ends with transitions '
-                    f'{last} of {name!r}, the phase does with {ends}'
+                    f'{last} of {name!r}, the phase itself with {ends}'
                 )  # fmt: skip
             source.commit(last)
         for name, last in zip(record.scorers, record.scores.tolist(), strict=True):
@@ -232,7 +233,7 @@ class RunChecks:
                 self._add('value', place, f'{describe(record)}: {name} not finite')
 
     def finish(self, place: Any) -> None:
-        """Say what never came, and what is only worth saying."""
+        """Report what never came, and add remarks on what is no fault."""
         for commit in self._waiting:
             self._commit(*commit)
         for source in self.sources.values():
@@ -265,5 +266,5 @@ class RunChecks:
             )
 
 
-def _said(record: TaskSpec) -> tuple[Any, ...]:
+def _values(record: TaskSpec) -> tuple[Any, ...]:
     return tuple(getattr(record, name) for name in TaskSpec.__slots__)

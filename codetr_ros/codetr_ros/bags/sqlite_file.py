@@ -23,8 +23,8 @@ class SqliteFile:
 
     Args:
         path: the file.
-        on_damage: is told what is wrong; by default that is an error.
-        shown: what it is called in places and errors, where it has been unpacked.
+        on_damage: receives each fault; by default the first is an error.
+        shown: the name in places and errors of a file that has been unpacked.
     """
 
     def __init__(
@@ -52,8 +52,8 @@ class SqliteFile:
         """Every message, in the order of the rows.
 
         Raises:
-            BagError: the file cannot be opened, is no such database, or is damaged (unless that is
-                told to `on_damage`).
+            BagError: the file cannot be opened, is no such database, or is damaged: `on_damage`,
+                if given, receives that instead.
         """
         try:
             with self.path.open('rb') as file:
@@ -67,12 +67,12 @@ class SqliteFile:
             finally:
                 connection.close()
         except OSError as error:
-            self._say(0, f'cannot be read: {error.strerror}', 0, unread=True)
+            self._report(0, f'cannot be read: {error.strerror}', 0, unread=True)
         except _DAMAGED as error:
-            self._say(0, f'the database is damaged: {error}', 0, _unread(error))
+            self._report(0, f'the database is damaged: {error}', 0, _unread(error))
 
     def _rows(self, connection: sqlite3.Connection, most: int) -> Iterator[RawMessage]:
-        """The messages; behind rows that cannot be read it goes on at the next that can."""
+        """The messages; after rows that cannot be read, those from the next that can."""
         row = 0
         while True:
             try:
@@ -82,7 +82,7 @@ class SqliteFile:
             except _DAMAGED as error:
                 following = _next_row(connection, row, most)
                 until = f'{following - 1}' if following else 'the last'
-                self._say(
+                self._report(
                     row + 1,
                     f'rows {row + 1} to {until} cannot be read, if there are any: {error}',
                     0,
@@ -98,7 +98,7 @@ class SqliteFile:
     def _rows_after(
         self, connection: sqlite3.Connection, row: int, most: int
     ) -> Iterator[RawMessage]:
-        # what claims more than the file has is not even asked for
+        # data that claims more bytes than the file has is not even fetched
         rows = connection.execute(
             'SELECT id, topic_id, timestamp, length(data), '
             'CASE WHEN length(data) <= ? THEN data END FROM messages WHERE id > ? ORDER BY id',
@@ -110,16 +110,18 @@ class SqliteFile:
             row = number
             channel = self._channels.get(topic)
             if channel is None or not isinstance(data, bytes) or type(time) is not int:
-                self._say(row, f'this is no message of a topic it knows: {topic!r}', length)
+                self._report(
+                    row, f'no message of a topic that the file describes: {topic!r}', length
+                )
                 continue
             if time < 0:
-                self._say(row, f'its time is {time} ns, before there was time', length)
+                self._report(row, f'its time is {time} ns, before there was time', length)
                 continue
             self.counts[channel.topic] += 1
             self.unchecked += 1
             yield RawMessage(channel, time, time, 0, data, Place(self.shown, row))
 
-    def _say(self, row: int, text: str, lost: int, unread: bool = False) -> None:
+    def _report(self, row: int, text: str, lost: int, unread: bool = False) -> None:
         damage = Damage(Place(self.shown, row), text, lost or 0, unread=unread)
         if self._on_damage is None:
             raise damage.error()
@@ -136,26 +138,26 @@ class SqliteFile:
 
 
 def _unread(error: Exception) -> bool:
-    """Whether the disk is at fault, not what is on it: SQLite says so in these words."""
+    """Whether the disk is at fault, not what is on it: SQLite has these words for that."""
     return 'disk I/O error' in str(error)
 
 
 def _next_row(connection: sqlite3.Connection, row: int, most: int) -> int | None:
-    """The first row behind a damaged one that can be read, None if there is none: looked for at
-    doubling distances, then halved back.
+    """The first readable row after a damaged one, None if there is none: searched for at doubling
+    distances, then by bisection.
     """
 
     def readable(number: int) -> tuple[bool, int | None]:
-        """Whether the row from this number on can be read, and which that is."""
+        """Whether the first row from this number on can be read, and its number."""
         try:
-            found = connection.execute(
+            first = connection.execute(
                 'SELECT id, CASE WHEN length(data) <= ? THEN data END FROM messages '
                 'WHERE id >= ? ORDER BY id LIMIT 1',
                 (most, number),
             ).fetchone()
         except _DAMAGED:
             return False, None
-        return True, found and found[0]
+        return True, first and first[0]
 
     step = 1
     while not readable(row + 1 + step)[0]:
@@ -189,13 +191,13 @@ def _channels(connection: sqlite3.Connection) -> dict[int, Channel]:
         name if name in columns else "''"
         for name in ('offered_qos_profiles', 'type_description_hash')
     ]
-    found = {}
-    for number, *said in connection.execute(
+    channels = {}
+    for number, *texts in connection.execute(
         f'SELECT id, name, type, serialization_format, {", ".join(optional)} FROM topics'
     ):
-        if type(number) is not int or not all(isinstance(text, str) for text in said):
-            raise sqlite3.DatabaseError(f'the row of topic {said[0]!r} is damaged')
-        topic, kind, encoding, qos, digest = said
+        if type(number) is not int or not all(isinstance(text, str) for text in texts):
+            raise sqlite3.DatabaseError(f'the row of topic {texts[0]!r} is damaged')
+        topic, kind, encoding, qos, digest = texts
         definition = Definition(*definitions.get(kind, ('', '')), digest)
-        found[number] = Channel(topic, kind, encoding, definition, qos)
-    return found
+        channels[number] = Channel(topic, kind, encoding, definition, qos)
+    return channels

@@ -58,7 +58,7 @@ def _installed(package: str, name: str, suffix: str) -> Path | None:
 
 
 def _interface_text(package: str, name: str) -> str:
-    """A definition as installed, or as it comes with the library where no ROS is installed."""
+    """A definition as installed, or the one that comes with the library if no ROS is installed."""
     from codetr_ros.bags import definitions
 
     if path := _installed(package, name, 'msg'):
@@ -67,8 +67,8 @@ def _interface_text(package: str, name: str) -> str:
         return text
     searched = ', '.join(str(share) for share in _share_folders())
     raise BagError(
-        f'no msg file of {package}/msg/{name} in {searched}: build the workspace, or '
-        f'source its setup file'
+        f'no msg file of {package}/msg/{name} in {searched}: build the workspace, or source its '
+        'setup file'
     )
 
 
@@ -108,8 +108,8 @@ def schema_text(type_name: str) -> bytes:
 
 @cache
 def type_hash(type_name: str) -> str:
-    """REP-2016 hash of a message type (`RIHS01_...`), from its installed description or, for what
-    comes with the library, from its definition.
+    """REP-2016 hash of a message type (`RIHS01_...`), from its installed description or, for types
+    that come with the library, from their definition.
 
     Raises:
         BagError: the description is not installed or does not name the type.

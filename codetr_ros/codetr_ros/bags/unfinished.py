@@ -1,4 +1,4 @@
-"""A new bag is there when it is whole, and not before."""
+"""A new bag appears once it is whole, not before."""
 
 import os
 import shutil
@@ -14,15 +14,15 @@ from codetr_ros.system.files import sync_folder
 
 @contextmanager
 def unfinished(folder: Path, again: str) -> Iterator[Path]:
-    """A folder of the same name to write a bag in; what it holds then is moved to where it
-    belongs, or is removed after an error. One that is killed leaves `.NAME.*.unfinished`.
+    """A temporary folder of the same name to write a bag in. At the end its content is moved to
+    where it belongs, or removed after an error. A killed process leaves `.NAME.*.unfinished`.
 
     Args:
         folder: where the bag belongs: does not exist, or is empty.
         again: what to do once there is room, such as 'label again'.
 
     Raises:
-        BagError: it holds something, or cannot be made or written.
+        BagError: the folder holds something, or cannot be made or written.
     """
     try:
         with _moved_when_whole(folder) as new:
@@ -44,7 +44,7 @@ def _moved_when_whole(folder: Path) -> Iterator[Path]:
             f'{folder} exists and holds {there[0]}: choose another folder, or remove it'
         )
     target.parent.mkdir(parents=True, exist_ok=True)
-    # within it, where it exists: it may be a disk of its own
+    # inside the target if that exists: it may be a disk of its own
     room = target if target.exists() else target.parent
     place = Path(tempfile.mkdtemp(prefix=f'.{target.name}.', suffix='.unfinished', dir=room))
     try:

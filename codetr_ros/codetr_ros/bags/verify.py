@@ -1,7 +1,7 @@
-"""Whether a bag is sound: everything that is wrong with it, found in one pass.
+"""Whether a bag is sound: everything that is wrong with it, from one pass.
 
-What is compared: every CRC, index and summary of an MCAP file; metadata.yaml with what is there;
-our recorder's numbering of each topic's messages; and what a run must be by its own records:
+It compares every CRC, index and summary of an MCAP file; metadata.yaml with what is there; our
+recorder's numbering of each topic's messages; and the records of each run with what a run must be:
 numbers without gaps, episodes that go on where they ended, one score for each segment, commits
 that name what is there, finite numbers, one run to a namespace.
 """
@@ -22,7 +22,7 @@ from codetr_ros.bags.run_checks import RunChecks
 
 @dataclass(frozen=True)
 class Verdict:
-    """What was found."""
+    """The findings on a bag, and the runs in it."""
 
     bag: Path
     findings: Findings
@@ -35,7 +35,7 @@ class Verdict:
         return not self.findings.counts
 
     def report(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """As JSON."""
         return {
             'bag': str(self.bag),
             'sound': self.sound,
@@ -80,7 +80,7 @@ def verify(path: Path | str) -> Verdict:
     """Read a bag from end to end and compare everything in it that can be compared.
 
     Raises:
-        BagError: there is no bag there that could be read at all.
+        BagError: there is no bag there that can be read at all.
     """
     findings = Findings()
 
@@ -122,6 +122,6 @@ def verify(path: Path | str) -> Verdict:
     if bag.unchecked:
         findings.remarks.append(
             f'{bag.unchecked} chunks or messages carry no CRC: a bit changed in them goes '
-            'unnoticed where it leaves a possible message behind'
+            'unnoticed where the result is still a possible message'
         )
     return Verdict(bag.path, findings, messages, runs)

@@ -1,4 +1,4 @@
-"""Writes a bag that loses nothing which was flushed: MCAP in small chunks, each with its CRC.
+"""Writes a bag that loses nothing once it is flushed: MCAP in small chunks, each with its CRC.
 
 A bag is a folder of MCAP files and a `metadata.yaml`, written last. The layout is rosbag2's:
 profile `ros2`, schemas as .msg text with all that they contain, `offered_qos_profiles` and
@@ -6,10 +6,10 @@ profile `ros2`, schemas as .msg text with all that they contain, `offered_qos_pr
 the next one begun. A process that is killed leaves its last file without index and the folder
 without metadata (so that no reader takes the bag for whole): every flushed message can still be
 read from it in order (`mcap.stream_reader`). The definitions lie in its first chunk, and again in
-a later one whenever the file has doubled, since only a finished file has them at its end too: of a
-file whose beginning is damaged, what lies behind as much again is read all the same.
+a later one whenever the file has doubled, since only a finished file has them at its end too. If
+the beginning of a file is damaged, it can still be read from the next repetition on.
 
-Messages are taken as the CDR bytes that came: nothing is decoded, so nothing can change.
+Messages are taken as the CDR bytes received: nothing is decoded, so nothing can change.
 """
 
 import os
@@ -30,8 +30,8 @@ from codetr_ros.bags.topics import BagTopic, schema_text, type_hash
 from codetr_ros.system.files import atomic_write, sync_folder
 
 CHUNK_BYTES = 64 * 1024
-"""Size at which a chunk is closed by itself: what a killed process can lose of messages not yet
-flushed."""
+"""Size at which a chunk is closed by itself: the most that a killed process loses of messages not
+yet flushed."""
 SPLIT_BYTES = 10**9
 """Size at which the next file is begun."""
 
@@ -41,10 +41,10 @@ class McapWriter:
 
     Args:
         folder: the bag; must not exist, or be empty.
-        topics: what will be written.
+        topics: that will be written.
         chunk_bytes: size at which a chunk is closed.
         split_bytes: size at which the next file is begun; 0: never.
-        keep_free: `check_room` complains when the disk has fewer bytes left.
+        keep_free: `check_room` raises an error when the disk has fewer bytes left.
 
     Raises:
         BagError: the folder holds something or cannot be made, or a type is not installed.
@@ -71,10 +71,10 @@ class McapWriter:
         self._good = 0  # bytes of it that are on the disk and whole
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            if found := sorted(p.name for p in folder.iterdir()):
+            if names := sorted(path.name for path in folder.iterdir()):
                 raise BagError(
-                    f'bag {folder} exists and holds {found[0]}: choose another folder, or '
-                    f'remove it'
+                    f'bag {folder} exists and holds {names[0]}: choose another folder, or remove '
+                    'it'
                 )
             self._open_file()
         except OSError as error:
@@ -92,7 +92,7 @@ class McapWriter:
         read alone.
         """
         file = BagFile(f'{self.folder.name}_{len(self._files)}.mcap')
-        # worked out first: a type that is missing leaves no file behind
+        # worked out first, so that a missing type leaves no file behind
         described = [
             (topic, schema_text(topic.type), type_hash(topic.type))
             for topic in self._topics.values()
@@ -136,12 +136,11 @@ class McapWriter:
             topic: its full name; one of the bag's topics.
             data: CDR bytes, with their header.
             log_time: when it was received [ns].
-            publish_time: when it was published [ns]; as received where not known, or where a
-                node says that it was before 1970, which the file cannot hold.
+            publish_time: when it was published [ns]. The log time is used if it is not known, or
+                if a node states a time before 1970, which the file cannot hold.
 
         Raises:
-            BagError: it cannot be written. The bag is then closed, and holds what had been
-                flushed.
+            BagError: it cannot be written. The bag is then closed, and holds what was flushed.
         """
         if self.closed:
             raise BagError(f'bag {self.folder} is closed: nothing can be written to it any more')
@@ -165,7 +164,7 @@ class McapWriter:
         if (at := self._stream.tell()) < self._again:
             return
         self._again = 2 * at
-        # mcap's writer has no call for it; the format allows it, as often as one likes
+        # mcap's writer has no call for this; the format allows it any number of times
         chunk, schemas, channels = (
             getattr(self._writer, f'_Writer__{name}')
             for name in ('chunk_builder', 'schemas', 'channels')
@@ -185,7 +184,7 @@ class McapWriter:
         """End the open chunk and wait until everything is on the disk.
 
         Raises:
-            BagError: it cannot be written. The bag is then closed, and holds what had been flushed
+            BagError: it cannot be written. The bag is then closed, and holds what was flushed
                 before.
         """
         try:
@@ -194,23 +193,23 @@ class McapWriter:
             raise self._broken(error) from error
 
     def check_room(self) -> None:
-        """Complain while the bag can still be closed as it should be.
+        """Raise an error while there is still room to close the bag properly.
 
         Raises:
-            BagError: the disk has less room left than was to be kept. The bag is as it was.
+            BagError: the disk has less room left than is to be kept. The bag is unchanged.
         """
         try:
             free = shutil.disk_usage(self.folder).free
         except OSError as error:
             raise BagError(
-                f'bag {self.folder}: its disk does not say what room is left: {error.strerror}. '
-                'Mend it, and start the run again in another folder'
+                f'bag {self.folder}: the room left on its disk is unknown: {error.strerror}. Mend '
+                'the disk, and start the run again in another folder'
             ) from error
         if free < self._keep_free:
             raise BagError(
                 f'bag {self.folder}: the disk has {free / 1e6:.1f} MB left, fewer than the '
                 f'{self._keep_free / 1e6:.1f} MB to be kept free: make room, and start the run '
-                f'again in another folder'
+                'again in another folder'
             )
 
     def _finish_file(self) -> None:
@@ -224,13 +223,12 @@ class McapWriter:
         self._path, self._good = None, 0
 
     def _broken(self, error: OSError) -> BagWriteError:
-        """Cut the file back to the last whole chunk: half a chunk would spoil what comes before it
-        for some readers.
+        """Cut the file back to the last whole chunk: for some readers, half a chunk would spoil
+        what comes before it.
         """
         self.closed = True
-        with suppress(
-            OSError
-        ):  # closing tries to write the buffer once more; the file is closed all the same
+        # closing tries to write the buffer once more; the file is closed all the same
+        with suppress(OSError):
             self._stream.close()
         left = 'the last file without an index'
         try:
@@ -244,7 +242,7 @@ class McapWriter:
             f'bag {self._path or self.folder} cannot be written: {error.strerror}. It holds the '
             f'{self.size} bytes flushed before, {left}. Make room, or mend the disk: '
             f'`codetr bag recover {self.folder} --out NEW` makes it whole; start the run again in '
-            f'another folder'
+            'another folder'
         )
 
     def close(self) -> None:
@@ -264,6 +262,6 @@ class McapWriter:
             atomic_write(self.folder / METADATA, render(self._files, self._topics.values()))
         except OSError as error:
             raise BagWriteError(
-                f'bag {self.folder} is whole but {METADATA} cannot be written: {error.strerror}; '
-                f'make room, `codetr bag recover {self.folder} --out NEW` writes it'
+                f'bag {self.folder} is whole but {METADATA} cannot be written: {error.strerror}. '
+                f'Make room, and `codetr bag recover {self.folder} --out NEW` writes it'
             ) from error

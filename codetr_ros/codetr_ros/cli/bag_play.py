@@ -77,12 +77,12 @@ def main(arguments: Sequence[str]) -> int:
         return refuse('--to nobody needs --pace recorded or --rate: nobody says when to go on')
 
     from codetr_ros.bags.errors import BagError
-    from codetr_ros.bags.playback import Pace, PlayError, items, survey
+    from codetr_ros.bags.playback import Pace, PlayError, items, recorded_run
     from codetr_ros.offline.sources import open_bags
 
     try:
         (bag,) = open_bags([Path(given.bag)])
-        recorded = survey(bag, given.run)
+        recorded = recorded_run(bag, given.run)
     except (BagError, PlayError) as error:
         return refuse(str(error))
     try:

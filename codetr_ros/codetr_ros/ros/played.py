@@ -5,7 +5,7 @@ from typing import Any
 
 from rclpy.logging import LoggingSeverity
 
-from codetr_ros.bags.playback import Recorded
+from codetr_ros.bags.playback import RecordedRun
 from codetr_ros.config import Settings
 from codetr_ros.cores.core import Silent
 from codetr_ros.records import TOPICS
@@ -67,7 +67,7 @@ class Cast:
         live: roles whose nodes are there themselves, and that nobody plays.
     """
 
-    def __init__(self, recorder: Membership, recorded: Recorded, live: Collection[str]) -> None:
+    def __init__(self, recorder: Membership, recorded: RecordedRun, live: Collection[str]) -> None:
         self._recorder = recorder
         self._recorded = recorded
         self._live = live

@@ -19,7 +19,7 @@ import rclpy
 from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
 
-from codetr_ros.bags.playback import Item, Pace, Playback, Recorded
+from codetr_ros.bags.playback import Item, Pace, Playback, RecordedRun
 from codetr_ros.config import Settings
 from codetr_ros.records import TOPICS, Commit, EpisodeResult, Metrics, RunSpec
 from codetr_ros.records.roles import WRITERS
@@ -40,7 +40,7 @@ MUST_AGREE = ('task', 'composite', 'beta', 'delay', 'phase_steps', 'simulators',
 """Settings under which the steps were made: a live learner must have the same."""
 
 
-def check_settings(recorded: Recorded, settings: Settings) -> None:
+def check_settings(recorded: RecordedRun, settings: Settings) -> None:
     """Refuse a live learner whose run the recorded steps cannot be part of.
 
     Args:
@@ -82,7 +82,7 @@ class Playing(PlayedWiring):
         self,
         member: Membership,
         joined: Joined,
-        recorded: Recorded,
+        recorded: RecordedRun,
         live: Collection[str],
         others: Cast,
     ) -> None:
@@ -247,7 +247,7 @@ class Player:
 
     def __init__(
         self,
-        recorded: Recorded,
+        recorded: RecordedRun,
         items: Callable[[], Iterator[Item]],
         live: Collection[str],
         pace: Pace | None,
@@ -284,7 +284,7 @@ class Player:
 
 
 def play(
-    recorded: Recorded,
+    recorded: RecordedRun,
     items: Callable[[], Iterator[Item]],
     live: Collection[str],
     pace: Pace | None,
