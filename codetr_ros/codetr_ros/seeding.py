@@ -1,4 +1,4 @@
-"""Random streams that depend on the run's seed and on what they are for, and on nothing else.
+"""Random streams that depend only on the run's seed and on their purpose.
 
 Neither interleaving nor a restart changes what a part of the run draws: each slice of work seeds
 its generators from (seed, core, phase, slice), and no generator state is ever saved.
@@ -17,7 +17,7 @@ def entropy(seed: int, *names: str | int) -> int:
 
 
 def generator(seed: int, *names: str | int) -> np.random.Generator:
-    """A numpy generator of its own for what `names` say."""
+    """A numpy generator of its own for the purpose that `names` describe."""
     return np.random.Generator(np.random.PCG64(entropy(seed, *names)))
 
 

@@ -1,4 +1,4 @@
-"""What a policy learner is: it turns what the memory D holds into a policy, phase by phase."""
+"""The protocol of policy learners, which turn the memory D into a policy, phase by phase."""
 
 import time
 from abc import ABC, abstractmethod
@@ -33,24 +33,24 @@ class PolicyLearner(Protocol):
 
     @property
     def actor(self) -> nn.Module:
-        """The policy network: its weights are what simulators act with."""
+        """The policy network, with whose weights simulators act."""
 
     @property
     def network(self) -> str:
         """The description of the policy network, as `describe` makes it."""
 
     def train(self, phase: int, memory: Trajectories) -> Iterator[dict[str, float]]:
-        """Learn from the memory once a phase has been taken into it.
+        """Learn from the memory once it has received a phase.
 
-        A slice per `next()`, each of which seeds its own random streams, so that neither
-        interleaving nor a restart changes what is drawn. Yields metrics, mostly none.
+        Each `next()` does one slice, which seeds its own random streams, so that neither
+        interleaving nor a restart changes what is drawn. It yields metrics, mostly none.
 
         Raises:
             LearnerError: the policy is not finite any more.
         """
 
     def state(self) -> dict[str, Tensor]:
-        """Everything that it takes to go on from here, in copies."""
+        """Copies of everything needed to go on from here."""
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Go on from a `state()`.
@@ -71,7 +71,7 @@ class OffPolicy(ABC):
     """
 
     lacking: str
-    """What is so where the memory has nothing to draw from, for the count of skipped updates."""
+    """Why there is nothing to draw from the memory, for the count of skipped updates."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
@@ -85,8 +85,8 @@ class OffPolicy(ABC):
 
     @abstractmethod
     def _prepare(self, memory: Trajectories) -> bool:
-        """Get ready to draw from the memory, which stays as it is during a phase's updates;
-        whether there is anything to draw.
+        """Prepare to draw from the memory, which does not change during a phase's updates. True if
+        there is anything to draw.
         """
 
     @abstractmethod
@@ -100,7 +100,7 @@ class OffPolicy(ABC):
         """
 
     def train(self, phase: int, memory: Trajectories) -> Iterator[dict[str, float]]:
-        """As many updates as the phase asks for, or none where there is nothing to draw.
+        """Take the updates of the phase, or none if there is nothing to draw.
 
         Raises:
             LearnerError: the policy is not finite any more.

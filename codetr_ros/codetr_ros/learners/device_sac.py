@@ -1,12 +1,12 @@
 """SAC that learns where its memory is: on a GPU, without the host in between.
 
 An update is one CUDA graph, recorded once: the drawing of steps and noise, the targets, both
-losses, Adam, the temperature and the targets' step. The host only asks for replays, and waits for
-none: until a phase's metrics are fetched, it is ahead of the GPU. Between phases it copies what is
+losses, Adam, the temperature and the targets' step. The host only starts replays and waits for
+none: it is ahead of the GPU until a phase's metrics are fetched. Between phases it copies what is
 new in the memory D.
 
-What differs from `FlatSAC`: which steps are drawn, and which noise, as they come from the device's
-generator. The update itself and the states are the same. On a CPU the same functions run, nothing
+Only the steps and the noise drawn differ from `FlatSAC`, because they come from the device's
+generator. The update itself and the states are the same. On a CPU the same functions run without
 being recorded. `sac.compile` compiles the update for the GPU before it is recorded.
 """
 
@@ -26,7 +26,7 @@ from codetr_ros.system.devices import usable
 
 Call: TypeAlias = Callable[[], None]
 WARM_UP_CALLS = 3
-"""Calls before the one that is recorded, for what libraries set up at the first ones."""
+"""Calls before the recorded one, in which libraries set themselves up."""
 
 
 class DeviceSAC(FlatSAC):
@@ -38,8 +38,8 @@ class DeviceSAC(FlatSAC):
         settings: widths, learning rates and the rest.
         seed: of the initial weights; torch's global generators are seeded from it.
         device: cpu, cuda, cuda:1, ...
-        record: makes of an update one that is faster and does the same. It may take updates
-            meanwhile, of which nothing remains. None: `cuda_graph` on a GPU, else nothing.
+        record: turns an update into a faster one that does the same. Any updates that it takes
+            meanwhile are undone. None: `cuda_graph` on a GPU, else the update itself.
 
     Raises:
         DeviceError: there is no such device here.
@@ -68,10 +68,10 @@ class DeviceSAC(FlatSAC):
         return *columns(rows, observation_size, action_size), noise
 
     def take(self, memory: Trajectories) -> bool:
-        """Bring what lies on the device up to date with the memory D.
+        """Bring the steps on the device up to date with the memory D.
 
-        The device's generator is used where an update is recorded: at the first labelled steps,
-        and when a source appears.
+        To record an update uses the device's generator: at the first labelled steps, and when a
+        source appears.
 
         Returns:
             Whether any step is labelled, so that `replay` may be called.
@@ -89,15 +89,15 @@ class DeviceSAC(FlatSAC):
         return True
 
     def replay(self, updates: int) -> dict[str, Tensor]:
-        """Updates in a row, from what was taken; on a GPU nobody waits for them.
+        """Updates in a row, from the steps that were taken; on a GPU the host does not wait.
 
         Returns:
-            What `SAC.update` says, summed over the updates: scalars on the device.
+            The metrics of `SAC.update`, summed over the updates: scalars on the device.
         """
         with torch.accelerator.device_index(self.device.index):
             for _ in range(updates):
                 self._recorded()
-            return self._said()
+            return self._take_metrics()
 
     @torch.no_grad()
     def _sample_and_update(self) -> None:
@@ -108,14 +108,14 @@ class DeviceSAC(FlatSAC):
 
 
 def cuda_graph(call: Call) -> Call:
-    """Record what a call asks of the current GPU; the result asks for the same again.
+    """Record the work that a call starts on the current GPU; the result starts it again.
 
-    It must read and write tensors that stay where they are, and wait for nothing. Random numbers
-    go on from one replay to the next: a graph knows the GPU's default generator, and a seed that
-    is set between two replays counts for the second.
+    The call must read and write tensors that stay where they are, and wait for nothing. Random
+    numbers go on from one replay to the next: a graph uses the GPU's default generator, and a seed
+    that is set between two replays takes effect in the second.
 
-    Each recording has a stream of its own: torch frees what cuBLAS keeps for a stream together
-    with the first of its graphs that goes, and the others would still use it.
+    Each recording has a stream of its own: when the first graph of a stream is freed, torch also
+    frees what cuBLAS keeps for that stream, which its other graphs would still use.
     """
     stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
     stream.wait_stream(torch.cuda.current_stream())
@@ -131,8 +131,8 @@ def cuda_graph(call: Call) -> Call:
 
 @contextmanager
 def _nothing_freed() -> Iterator[None]:
-    """Free what nobody uses any more before, not meanwhile: CUDA ends a recording during which
-    another graph goes, and learners go when garbage is collected, as they refer to themselves.
+    """Collect garbage before a recording and not during it: CUDA ends a recording during which
+    another graph is freed, and only the collector frees learners, which refer to themselves.
     """
     gc.collect()
     collecting = gc.isenabled()

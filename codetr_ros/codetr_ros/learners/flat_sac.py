@@ -1,10 +1,10 @@
 """The update of `sac.SAC` made fast: gradients by hand, weights in a few flat tensors.
 
 All parameters of one optimiser lie in one tensor, Adam's moments likewise, so that a step of Adam
-or of the targets is one call; what others know as weights and moments are views of these. One pass
+or of the targets is one call; the weights and moments that others see are views of these. One pass
 of the actor serves both s' and s. In the actor's step gradients go through the critics to the
-actions and no further. Nothing is left to autograd: what it would do is written out below, and
-equals it up to rounding.
+actions and no further. Autograd is not used: its work is written out below, and gives the same up
+to rounding.
 
 Shapes: B = batch, O = observation size, A = action size, H = width of a hidden layer. A network is
 a stack of N networks, N = 1 (actor) or 2 (critics, targets): its layers are weights (N, in, out)
@@ -28,9 +28,9 @@ from codetr_ros.system import freed_memory
 from codetr_ros.system.compilation import compiled
 
 METRICS = ('critic_loss', 'actor_loss', 'temperature', 'entropy', 'q_mean')
-"""What `SAC.update` says, in the order in which it is summed here."""
+"""The metrics of `SAC.update`, in the order in which they are summed here."""
 DRAWN_AT_ONCE = 64
-"""Updates whose steps and noise are drawn in one go; more would take memory and save no time."""
+"""Updates whose steps and noise are drawn at once; more would take memory and save no time."""
 
 
 class FlatSAC(SAC):
@@ -44,7 +44,7 @@ class FlatSAC(SAC):
         seed: int,
         device: torch.device | str = 'cpu',
     ) -> None:
-        """Make the networks: for the same arguments those of the plain form.
+        """Make the networks: the same as the plain form makes for the same arguments.
 
         Args:
             observation_size: O.
@@ -72,8 +72,8 @@ class FlatSAC(SAC):
             self._compile(self._example(observation_size, action_size))
 
     def _example(self, observation_size: int, action_size: int) -> tuple[Tensor, ...]:
-        """Arguments of `_update` that lie in memory as those of every update will: each in memory
-        of its own, as what is compiled for two in one place is of no use to others.
+        """Arguments of `_update` that lie in memory like those of every update: each in memory of
+        its own, because code compiled for two arguments in one place serves no others.
         """
         B, O, A = self.batch, observation_size, action_size  # noqa: E741
         shapes = (B, O), (B, A), (B,), (B, O), (B,), (2, B, A)
@@ -81,7 +81,7 @@ class FlatSAC(SAC):
 
     @torch.no_grad()
     def _compile(self, example: tuple[Tensor, ...]) -> None:
-        """Have the update compiled, by one of which nothing remains."""
+        """Compile the update by taking one, which is then undone."""
         state = self.state()
         self._step = compiled(self._update, example, without='sac.compile=false')
         self.load_state(state)
@@ -90,27 +90,27 @@ class FlatSAC(SAC):
     def update(self, batch: StepBatch) -> dict[str, Tensor]:
         """One update of everything, as `SAC.update`."""
         self._learn(batch, 1)
-        return self._said()
+        return self._take_metrics()
 
     def burst(self, updates: int, draw: Callable[[int], StepBatch]) -> dict[str, Tensor]:
-        """Many updates.
+        """Take many updates.
 
         Args:
             updates: how many.
-            draw: gives the steps to learn from, as many as it is asked for.
+            draw: draws a number of steps to learn from.
 
         Returns:
-            What `SAC.update` says, summed over the updates.
+            The metrics of `SAC.update`, summed over the updates.
         """
         for first in range(0, updates, DRAWN_AT_ONCE):
             count = min(DRAWN_AT_ONCE, updates - first)
             self._learn(draw(count * self.batch), count)
-        return self._said()
+        return self._take_metrics()
 
-    def _said(self) -> dict[str, Tensor]:
-        said = dict(zip(METRICS, self._sums.clone(), strict=True))
+    def _take_metrics(self) -> dict[str, Tensor]:
+        metrics = dict(zip(METRICS, self._sums.clone(), strict=True))
         self._sums.zero_()
-        return said
+        return metrics
 
     @torch.no_grad()
     def _learn(self, batch: StepBatch, updates: int) -> None:
@@ -131,7 +131,7 @@ class FlatSAC(SAC):
     def _update(
         self, s: Tensor, a: Tensor, r: Tensor, s2: Tensor, going_on: Tensor, noise: Tensor
     ) -> None:
-        """One update; what it says is added to the sums.
+        """One update; its metrics are added to the sums.
 
         Args:
             s: observations (B, O).
@@ -203,10 +203,9 @@ class FlatSAC(SAC):
 
 
 class FlatAdam(Adam):
-    """Adam for parameters that lie in one tensor, and one step for gradients that are given.
+    """Adam for parameters that lie in one tensor, one step at a time for given gradients.
 
-    The parameters become views of `flat`, and the moments that `state` tells of those of `mean`
-    and `square`.
+    The parameters become views of `flat`, and the moments in `state` views of `mean` and `square`.
     """
 
     def __init__(
@@ -232,7 +231,7 @@ class FlatAdam(Adam):
 
     def descend(self, gradients: Sequence[Tensor]) -> None:
         """One step down these gradients: as many numbers as parameters, in their order."""
-        compiling = torch.compiler.is_compiling()  # the fused form cannot be, but need not be
+        compiling = torch.compiler.is_compiling()  # the fused form cannot be compiled
         adam(
             [self.flat],
             [torch.cat([g.reshape(-1) for g in gradients])],
@@ -259,7 +258,7 @@ def _stack_of_one(parameters: Sequence[Tensor]) -> list[Tensor]:
 
 
 def pairs(observations: Tensor, actions: Tensor) -> Tensor:
-    """What both critics look at: (2, B, O+A)."""
+    """The input of both critics: (2, B, O+A)."""
     return torch.cat([observations, actions], -1).expand(2, -1, -1)
 
 
@@ -272,7 +271,7 @@ def forward(network: Sequence[Tensor], x: Tensor) -> list[Tensor]:
 
 
 def values(critic: Sequence[Tensor], activations: Sequence[Tensor]) -> Tensor:
-    """What critics whose activations are given think of each pair: (2, B)."""
+    """The values (2, B) that critics with these activations give to each pair."""
     # faster than a product with one column
     return (activations[-1] * critic[-2].mT).sum(-1) + critic[-1].squeeze(-1)
 
@@ -280,16 +279,16 @@ def values(critic: Sequence[Tensor], activations: Sequence[Tensor]) -> Tensor:
 def slopes(
     network: Sequence[Tensor], activations: Sequence[Tensor], gradient: Tensor
 ) -> list[Tensor]:
-    """Gradients with respect to what enters the ReLU of each hidden layer, the first one first.
+    """Gradients with respect to the input of each hidden layer's ReLU, the first one first.
 
     Args:
         network: its layers.
-        activations: what `forward` made of it.
+        activations: the result of `forward`.
         gradient: with respect to the last activations.
     """
-    found: list[Tensor] = []
+    gradients: list[Tensor] = []
     for i in reversed(range(1, len(activations))):
-        found.insert(0, torch.ops.aten.threshold_backward(gradient, activations[i], 0))
+        gradients.insert(0, torch.ops.aten.threshold_backward(gradient, activations[i], 0))
         if i > 1:
-            gradient = found[0] @ network[2 * i - 2].mT
-    return found
+            gradient = gradients[0] @ network[2 * i - 2].mT
+    return gradients

@@ -48,7 +48,7 @@ class FromLabels(OffPolicy):
         return self._sac.burst(updates, partial(memory.labelled.sample, rng))
 
     def state(self) -> dict[str, Tensor]:
-        """Everything that it takes to go on from here, in copies."""
+        """Copies of everything needed to go on from here."""
         return self._sac.state()
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
@@ -61,7 +61,7 @@ class FromLabels(OffPolicy):
 
 
 class FromLabelsOnDevice(FromLabels):
-    """The same on the device of the settings, which draws the steps itself."""
+    """The same learner on the device of the settings, which draws the steps itself."""
 
     _sac: DeviceSAC
 

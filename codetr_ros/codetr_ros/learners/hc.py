@@ -6,18 +6,19 @@ critic therefore sees the segment so far, and is a sum of two parts:
 
     Q(tau_{t_i:t+1}) = H(tau_{t_i:t}) + C(s_t, a_t)
 
-of which only C depends on the action: the actor follows C alone, free of the variance that H
-carries. A regulariser ties H of a whole segment to its score. The policy sees how far the segment
-is, (t - t_i) / n, as one more observation, and so does C.
+Only C depends on the action: the actor follows C alone, free of the variance that H carries. A
+regulariser ties H of a whole segment to its score. The policy sees how far the segment is,
+(t - t_i) / n, as one more observation, and so does C.
 
 No step is labelled: this learner takes the composite rewards themselves, and needs no reward node.
 
-How certain this is: the formulas are recalled from the paper and agree with what the documentation
-of a third-party port says of its section 4 (equations 6 to 9); its text and its code could not be
-had. That the published code does any of this in the same way is not claimed. Decided here:
+How certain this is: the formulas are recalled from the paper and agree with the documentation of a
+third-party port on the paper's section 4 (equations 6 to 9). The paper's text and code could not
+be had, and it is not claimed that the published code does any of this in the same way. Decided
+here:
 
-- H and C are fitted together to one target, as the formula above has it; the port mentioned fits
-  them one after the other.
+- H and C are fitted together to one target, by the formula above; the port fits them one after the
+  other.
 - Twin critics as in SAC: each has its own H and C, the target takes the smaller of the two sums,
   the actor the smaller C.
 - The segment's end empties the history, also where the time limit cuts the segment short; nothing
@@ -103,7 +104,7 @@ class HC(OffPolicy):
         return self._actor
 
     def train(self, phase: int, memory: Trajectories) -> Iterator[dict[str, float]]:
-        """As many updates as the phase asks for, or none where nothing is scored.
+        """Take the updates of the phase, or none if nothing is scored.
 
         Raises:
             LearnerError: the policy is not finite any more.
@@ -131,7 +132,7 @@ class HC(OffPolicy):
         return totals
 
     def update(self, batch: HistoryBatch) -> dict[str, Tensor]:
-        """One update of everything. What is random comes from torch's global generator.
+        """One update of everything, with noise from torch's global generator.
 
         Returns:
             Scalar tensors: `critic_loss` of the temporal difference alone, `history_loss` (the
@@ -195,7 +196,7 @@ class HC(OffPolicy):
     def actor_loss(
         self, observations: Tensor, noise: Tensor, alpha: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """The actor's loss, and the log-probabilities (B,) of what it did.
+        """The actor's loss, and the log-probabilities (B,) of its actions.
 
         Args:
             observations: (B, O+1), with the place in the segment.
@@ -207,7 +208,7 @@ class HC(OffPolicy):
         return (alpha * log_prob - value).mean(), log_prob
 
     def _scores(self, batch: HistoryBatch) -> Tensor:
-        """Composite rewards (S,) in the unit that the settings ask for."""
+        """Composite rewards (S,) in the unit of the settings."""
         unit = self.target_scale if self._settings.reward_unit == 'scaled' else 1.0
         return torch.tensor(batch.values / unit)
 
@@ -217,13 +218,13 @@ class HC(OffPolicy):
         return torch.cat([observations, place[:, None]], -1)
 
     def state(self) -> dict[str, Tensor]:
-        """All that the next update depends on but its batch and the generator: copies, by name."""
+        """Copies of all that the next update depends on except batch and generator, by name."""
         return {name: tensor.clone() for name, tensor in self._tensors().items()} | {
             'target_scale': torch.tensor(self.target_scale, dtype=torch.float64)
         }
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Take over what `state` returned.
+        """Restore what `state` returned.
 
         Raises:
             LearnerError: it is another learner's or architecture's; nothing has changed then.

@@ -1,4 +1,4 @@
-"""What came before a step of its segment: drawn from the memory, and valued by a network.
+"""The steps of a segment before a given one: drawn from the memory, and valued by a network.
 
 Shapes: S = segments, L = steps of the longest, B = batch of steps, O = observation size, A =
 action size. Everything comes for two critics at once, in a leading dimension of 2.
@@ -27,7 +27,7 @@ class HistoryBatch:
     lengths: I64  # (S,)
     values: F64  # (S,) the composite rewards
     terminal: NDArray[np.bool_]  # (S,) the segment ended in a terminal state
-    owners: I64  # (B,) whose step it is: an index of the segments
+    owners: I64  # (B,) each step's segment: an index of the segments
     steps: I64  # (B,) the step's index t - t_i within its segment
 
 
@@ -89,9 +89,9 @@ class Singleton(nn.Module):
 class Recurrent(nn.Module):
     """H(history) = a linear function of the state of a GRU that has read the history.
 
-    Before its first step the state is zero; the linear function's bias is then what is learnt. A
-    segment is read once, and gives the values of all its beginnings: the GRU is causal, so that
-    what stands behind them, padding included, changes nothing.
+    The state before the first step is zero, so that only the linear function's bias is learnt
+    there. A segment is read once and gives the values of all its beginnings: the GRU is causal, so
+    that whatever follows a beginning, padding included, changes nothing.
     """
 
     def __init__(
@@ -121,4 +121,4 @@ HISTORIES: dict[str, type[Singleton | Recurrent]] = {
     'singleton': Singleton,
     'recurrent': Recurrent,
 }
-"""Networks that value a history, by the name that `hc.history` gives them."""
+"""Networks that value a history, by their name in `hc.history`."""

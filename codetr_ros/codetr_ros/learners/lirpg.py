@@ -2,8 +2,8 @@
 Rewards for Policy Gradient Methods", NeurIPS 2018, arXiv 1804.06459).
 
 The policy, theta, is trained by PPO on an intrinsic reward r(s, a; eta) of every step. After each
-of its updates the intrinsic reward is changed so that the updated policy theta' would have done
-better by what really counts, the composite rewards:
+of its updates the intrinsic reward is changed so that the updated policy theta' would have earned
+more of what really counts, the composite rewards:
 
     theta' = theta - Adam(gradient of the PPO loss with advantages of c_in r(s, a; eta) + c_ex R)
     eta'   = eta - Adam(gradient, through theta', of the PPO loss of theta' with advantages of R)
@@ -12,30 +12,30 @@ On-policy, with a gradient through the policy: it runs in process and in lock-st
 from each phase's steps once the phase is over, and forgets them. Nothing labels steps and there is
 no reward node; R is a segment's composite reward at its last step and 0 elsewhere.
 
-How certain this is: structure and constants are those of the authors' published code, as it was
-read; so is an Adam by hand whose second moment is a constant to the meta-gradient. What is marked
-(recalled) was not looked up again. That the comparison in the CoDeTr paper used that code, with
-its delay of rewards set to n, is inferred. What differs, on purpose:
+How certain this is: structure and constants were read from the authors' published code, and so was
+the handwritten Adam whose second moment is a constant to the meta-gradient. Points marked
+(recalled) were not looked up again. It is inferred that the comparison in the CoDeTr paper used
+that code, with its delay of rewards set to n. The differences, all on purpose:
 
-- A phase (`phase_steps`, 1000) takes the place of 2048 steps; `lirpg.batch` is their size of a
-  minibatch, 64, where they have a number of minibatches, 32.
-- Actions are tanh(u) of a Gaussian u, as for every policy here, where theirs are Gaussian and
-  clipped by the environment (recalled). Losses are those of u, which the action gives back: what
-  tanh does to the density cancels in PPO's ratio.
-- Composite rewards are made of raw rewards and then divided by the running deviation of their
-  discounted return, where theirs are scaled first and summed up then: a composite is not linear.
+- A phase (`phase_steps`, 1000) takes the place of 2048 steps. `lirpg.batch` sets the size of a
+  minibatch to theirs, 64; they set the number of minibatches, 32.
+- Actions are tanh(u) of a Gaussian u, as for every policy here; theirs are Gaussian and clipped by
+  the environment (recalled). Losses are those of u, recovered from the action: the effect of tanh
+  on the density cancels in PPO's ratio.
+- Composite rewards are computed from raw rewards and then divided by the running deviation of
+  their discounted return; theirs are scaled first and then summed: a composite is not linear.
   `target_scale` and `reward_unit` do not matter. The running return begins anew with each phase.
 - Moments of the observations change between phases, not between steps, so that a phase has one
   policy. They begin with the warm-up's random steps, from which nothing else is learnt.
 - At the time limit values are bootstrapped, as everywhere here; theirs are not (recalled).
-- The value loss is a plain squared error (half of it, times `value_coefficient`), where theirs is
-  clipped (recalled); there is no bonus for entropy (their coefficient is 0). The form of Adam's
-  step size and where its epsilon stands are torch's.
+- The value loss is a plain squared error (half of it, times `value_coefficient`); theirs is
+  clipped (recalled). There is no bonus for entropy (their coefficient is 0). Adam's step size and
+  the place of its epsilon are torch's.
 
-Decided here, where nothing was known: both objectives normalise advantages by minibatch; the norm
+Decided here, where nothing was known: Both objectives normalise advantages by minibatch. The norm
 of gradients is bounded for each of the two updates by itself, policy with value and intrinsic
-reward with value of R, and the meta-gradient goes through that bound and through the
-normalisation; eta and theta move together after each minibatch.
+reward with value of R. The meta-gradient goes through that bound and through the normalisation.
+Eta and theta move together after each minibatch.
 
 Shapes: T = steps of the phase, B = steps of a minibatch, O, A = sizes of observation and action.
 
@@ -75,7 +75,7 @@ KIND = 'standardised_tanh_gaussian_mlp'
 REWARD_CLIP = 10.0
 """Scaled composite rewards are clipped to this (baselines' VecNormalize)."""
 LARGEST_ACTION = 1 - 1e-6
-"""Actions are taken back to before their squash from no nearer to 1 than this."""
+"""Actions are clipped to this before their squash is inverted."""
 
 
 def value_network(inputs: int, hidden: Sequence[int]) -> nn.Sequential:
@@ -89,7 +89,7 @@ def value_network(inputs: int, hidden: Sequence[int]) -> nn.Sequential:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class PhaseBatch:
-    """A phase's steps, with all that stays as it is while they are learnt from."""
+    """A phase's steps, with all that stays fixed while they are learnt from."""
 
     observations: Tensor  # (T, O) standardised
     actions: Tensor  # (T, A)
@@ -167,7 +167,7 @@ class Lirpg:
         yield means | {'update_seconds': time.perf_counter() - began}
 
     def prepare(self, rollout: Rollout) -> PhaseBatch:
-        """What a phase's steps are learnt from: by the policy and the values as they are now."""
+        """The batch of a phase's steps, by the policy and the values as they are now."""
         own = self._settings.lirpg
         returns = discounted_returns(rollout, own.discount)
         self._return_moments.add(returns[:, None])
@@ -228,8 +228,8 @@ class Lirpg:
         }
 
     def policy_gradients(self, batch: PhaseBatch, indices: Tensor) -> list[Tensor]:
-        """The inner gradients, by theta, as functions of eta: clipped, of PPO's loss on mixed
-        rewards.
+        """The inner gradients, of PPO's loss on mixed rewards with respect to theta: clipped, and
+        functions of eta.
         """
         own = self._settings.lirpg
         rewards = own.intrinsic_coefficient * self.intrinsic_rewards(batch)
@@ -247,8 +247,8 @@ class Lirpg:
     def outer_losses(
         self, theta: Sequence[Tensor], batch: PhaseBatch, indices: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """What eta is to lower: PPO's loss of the policy in `theta` with advantages of R alone,
-        and that of R's value.
+        """The losses that eta is to lower: PPO's loss of the policy in `theta` with advantages of
+        R alone, and the loss of R's value.
         """
         policy = theta[: len(self._policy_names)]
         value = self.extrinsic_value(batch.observations[indices]).squeeze(-1)
@@ -296,13 +296,13 @@ class Lirpg:
         return standardise(observations, actor.observation_mean, actor.observation_deviation)
 
     def _observe(self, observations: F32) -> None:
-        """Let the policy that acts next know these observations (T, O) too."""
+        """Include these observations (T, O) in the moments of the policy that acts next."""
         self._moments.add(observations)
         self.actor.observation_mean.copy_(self._moments.mean)
         self.actor.observation_deviation.copy_(self._moments.deviation)
 
     def state(self) -> dict[str, Tensor]:
-        """Everything that it takes to go on from here, in copies."""
+        """Copies of everything needed to go on from here."""
         return {name: tensor.clone() for name, tensor in self._tensors().items()}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
@@ -318,12 +318,12 @@ class Lirpg:
 
     def _tensors(self) -> dict[str, Tensor]:
         """The state itself, by name."""
-        found: dict[str, Tensor] = {}
+        tensors: dict[str, Tensor] = {}
         for name in ('actor', 'value', 'extrinsic_value', 'intrinsic_reward'):
             weights = getattr(self, name).state_dict()
-            found |= {f'{name}.{key}': tensor for key, tensor in weights.items()}
+            tensors |= {f'{name}.{key}': tensor for key, tensor in weights.items()}
         for name, adam in (('theta', self._theta_adam), ('eta', self._eta_adam)):
-            found |= {f'{name}_adam.{key}': tensor for key, tensor in adam.state().items()}
+            tensors |= {f'{name}_adam.{key}': tensor for key, tensor in adam.state().items()}
         for name, moments in (('observed', self._moments), ('returned', self._return_moments)):
-            found |= {f'{name}.{key}': tensor for key, tensor in moments.tensors.items()}
-        return found
+            tensors |= {f'{name}.{key}': tensor for key, tensor in moments.tensors.items()}
+        return tensors

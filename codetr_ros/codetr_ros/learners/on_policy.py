@@ -1,4 +1,4 @@
-"""What a learner from its own latest steps needs: running moments, advantages, an Adam with a
+"""Tools of a learner from its own latest steps: running moments, advantages, an Adam with a
 gradient.
 
 Shapes: T = steps of a phase, B = steps of a minibatch.
@@ -17,7 +17,7 @@ from codetr_ros.records import F32, F64, I64
 
 
 class RunningMoments:
-    """Mean and standard deviation of all that was added so far, component by component."""
+    """Mean and standard deviation of all rows added so far, component by component."""
 
     def __init__(self, size: int) -> None:
         self.tensors = {
@@ -51,7 +51,7 @@ class RunningMoments:
 
 
 def discounted_returns(rollout: Rollout, discount: float) -> F64:
-    """(T,): what has been earned up to each step of its episode, past rewards discounted."""
+    """(T,): the rewards up to each step of its episode, past ones discounted."""
     returns = np.zeros(len(rollout.rewards))
     running = 0.0
     for t, reward in enumerate(rollout.rewards):
@@ -65,8 +65,8 @@ def discounted_returns(rollout: Rollout, discount: float) -> F64:
 def ends(last: NDArray[np.bool_]) -> I64:
     """(T,): the index of the last step of each step's stretch of consecutive steps."""
     where = np.flatnonzero(last)
-    found: I64 = where[np.searchsorted(where, np.arange(len(last)))]
-    return found
+    indices: I64 = where[np.searchsorted(where, np.arange(len(last)))]
+    return indices
 
 
 def trace(indices: Tensor, stretch_ends: Tensor, decay: float) -> Tensor:
@@ -106,7 +106,7 @@ def _root(square: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Step:
-    """What a step of Adam leads to."""
+    """The result of a step of Adam."""
 
     values: list[Tensor]
     means: list[Tensor]
@@ -119,7 +119,7 @@ class DifferentiableAdam:
     The second moment takes the gradient as a constant; the derivative goes through the first one.
 
     Args:
-        parameters: what it moves.
+        parameters: the tensors that it updates.
         learning_rate: its step size.
         epsilon: added to the root of the second moment.
     """
@@ -132,7 +132,7 @@ class DifferentiableAdam:
         self.steps = torch.zeros((), dtype=torch.float64)
 
     def propose(self, gradients: Sequence[Tensor]) -> Step:
-        """Where a step would lead, as a function of the gradients; nothing changes yet."""
+        """The result of a step, as a function of the gradients; nothing changes yet."""
         n = float(self.steps) + 1
         means = [0.9 * m + 0.1 * g for m, g in zip(self.means, gradients, strict=True)]
         squares = [

@@ -9,12 +9,12 @@ from codetr_ros.learners.hc import HC
 from codetr_ros.learners.lirpg import Lirpg
 
 METHODS: dict[str, Callable[[Settings, int, int], PolicyLearner]] = {'hc': HC, 'lirpg': Lirpg}
-"""Policy learners by the name that `settings.method` gives them. Every other method is one of
-rewards: it labels steps, and SAC learns from the labels."""
+"""Policy learners by their name in `settings.method`. Every other method is a reward method: it
+labels steps, and SAC learns from the labels."""
 
 
 def make(settings: Settings, observation_size: int, action_size: int) -> PolicyLearner:
-    """Make the policy learner that the settings ask for.
+    """Make the policy learner that the settings name.
 
     Args:
         settings: the run's settings.
@@ -22,7 +22,7 @@ def make(settings: Settings, observation_size: int, action_size: int) -> PolicyL
         action_size: A of the task.
 
     Raises:
-        DeviceError: the device of the settings is not here.
+        DeviceError: the device of the settings is not available.
     """
     from_labels = FromLabels if settings.device == 'cpu' else FromLabelsOnDevice
     learner = METHODS.get(settings.method, from_labels)

@@ -1,6 +1,6 @@
 """Soft actor-critic (Haarnoja et al., arXiv 1812.05905) as jaxrl has it, in paper order.
 
-Where jaxrl differs from other implementations, jaxrl is followed: orthogonal initial weights with
+Where implementations differ, this one follows jaxrl: orthogonal initial weights with
 gain sqrt(2), the critics' output layer included; a hard clip of the log standard deviation; no
 factor 1/2 in the critic loss; a target entropy of -A/2; a temperature loss whose gradient goes
 through exp.
@@ -30,7 +30,7 @@ from codetr_ros.system.states import check_state
 
 
 class SacError(LearnerError):
-    """A state that does not fit this learner: the message names what came and what was due."""
+    """A state that does not fit this learner: names what was given and what was expected."""
 
 
 class SAC:
@@ -67,7 +67,7 @@ class SAC:
         """One update of everything.
 
         Returns:
-            Scalar tensors, to be converted once they are looked at (a conversion waits for the
+            Scalar tensors, to be converted when they are read (a conversion waits for the
             result): `critic_loss`, `actor_loss`, `temperature` (alpha before the update),
             `entropy` of the policy [nats], `q_mean` over the batch and both critics.
         """
@@ -78,7 +78,7 @@ class SAC:
         alpha = self.log_temperature.detach().exp()
 
         # Target: y = r + gamma (1 - terminated) (min_i Q'_i(s', a') - alpha log pi(a'|s')),
-        # a' ~ pi(s'). What was cut short at its horizon has not terminated: it is bootstrapped.
+        # a' ~ pi(s'). An episode cut short at its horizon has not terminated: it is bootstrapped.
         with torch.no_grad():
             a2, log_prob2 = squashed_gaussian(self.actor(s2), noise2)
             value2 = torch.minimum(*q_values(self.target, s2, a2)) - alpha * log_prob2
@@ -112,13 +112,13 @@ class SAC:
         }
 
     def state(self) -> dict[str, Tensor]:
-        """All that the next update depends on but its batch and the generator: copies on the CPU,
-        by name.
+        """All that the next update depends on except its batch and the generator: copies on the
+        CPU, by name.
         """
         return {name: tensor.to('cpu', copy=True) for name, tensor in self._tensors().items()}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Take over what `state` returned.
+        """Restore what `state` returned.
 
         Raises:
             SacError: it is another learner's or architecture's; nothing has changed then.

@@ -1,6 +1,6 @@
-"""A policy to act with, one observation at a time: made from what the learner published.
+"""A policy to act with, one observation at a time, made from the record of the learner.
 
-Between them a policy travels as a JSON description and safetensors bytes, never as a pickle.
+The record carries a JSON description and safetensors bytes, never a pickle.
 Shapes: O = observation size, A = action size.
 """
 
@@ -25,20 +25,18 @@ from codetr_ros.policy.actor import (
 from codetr_ros.records import F32, Policy
 
 MAX_LAYERS = 8
-
-
 MAX_WIDTH = 65_536
 
 
 class NetworkError(ValueError):
-    """A policy that cannot be acted with: the message names what was expected and what came."""
+    """A policy that cannot be used: names what was expected and what was received."""
 
 
 class ActingPolicy:
     """A policy to act with, one observation at a time.
 
     The same weights, observation and noise give the same bits in every process (of one CPU type
-    and thread count): the weights are copied into memory of their own, because the last bit of a
+    and thread count). For this the weights are copied into memory of their own: the last bit of a
     product with one row depends on where its matrix lies, and a received message lies anywhere.
 
     Args:
@@ -64,10 +62,10 @@ class ActingPolicy:
         """The policy that a record carries.
 
         Args:
-            policy: what the learner published. The widths of its layers are its own affair.
-            observation_size: O of the task that it is to act in.
+            policy: the learner's record. The widths of its layers may be any.
+            observation_size: O of the task in which it is to act.
             action_size: A of that task.
-            delay: steps n of the segments into which episodes are cut; 0 where they are not.
+            delay: steps n of the segments into which episodes are cut; 0 if they are not.
 
         Raises:
             NetworkError: the policy is of another architecture or for other segments, or its
@@ -79,9 +77,11 @@ class ActingPolicy:
             raise NetworkError(
                 f'{name} is random and has no weights: draw its actions uniformly from [-1, 1]'
             )
-        said = _parse(policy.network, name)
-        hidden, segment_steps = _hidden(said, name), _segment_steps(said, name, delay)
-        kind = next((kind for kind in KINDS if kind == said.get('kind')), 'tanh_gaussian_mlp')
+        description = _parse(policy.network, name)
+        hidden = _hidden(description, name)
+        segment_steps = _segment_steps(description, name, delay)
+        named = description.get('kind')
+        kind = next((kind for kind in KINDS if kind == named), 'tanh_gaussian_mlp')
         expected = describe(observation_size, action_size, hidden, segment_steps, kind)
         if policy.network != expected:
             raise NetworkError(
@@ -114,7 +114,7 @@ class ActingPolicy:
             (A,) in [-1, 1]: tanh(mean), or tanh(mean + std * noise).
 
         Raises:
-            NetworkError: the policy needs to know the step, and it was not said.
+            NetworkError: the policy needs the step, and none was given.
         """
         x = torch.from_numpy(observation)
         if self._segment_steps:
@@ -145,22 +145,24 @@ def _own(tensor: Tensor) -> Tensor:
 
 
 def _parse(network: str, name: str) -> dict[str, Any]:
-    """What a description says."""
+    """The content of a description."""
     try:
-        said = json.loads(network)
-        if not isinstance(said, dict) or not {'hidden', 'segment_steps'} <= said.keys():
+        description = json.loads(network)
+        if not isinstance(description, dict):
+            raise ValueError
+        if not {'hidden', 'segment_steps'} <= description.keys():
             raise ValueError
     except ValueError:
         raise NetworkError(
             f"{name}: its network description is not one of this version's: {network!r}; "
             f'expected something like {describe(1, 1, [256, 256])}'
         ) from None
-    return said
+    return description
 
 
-def _hidden(said: dict[str, Any], name: str) -> list[int]:
+def _hidden(description: dict[str, Any], name: str) -> list[int]:
     """Hidden widths that a description names."""
-    hidden = said['hidden']
+    hidden = description['hidden']
     if (
         not isinstance(hidden, list)
         or not 1 <= len(hidden) <= MAX_LAYERS
@@ -168,14 +170,14 @@ def _hidden(said: dict[str, Any], name: str) -> list[int]:
     ):
         raise NetworkError(
             f'{name}: its network description names hidden widths {hidden!r}; '
-            f'allowed are 1 to {MAX_LAYERS} whole numbers from 1 to {MAX_WIDTH}'
+            f'1 to {MAX_LAYERS} whole numbers from 1 to {MAX_WIDTH} are allowed'
         )
     return hidden
 
 
-def _segment_steps(said: dict[str, Any], name: str, delay: int) -> int:
-    """Steps of the segments that a description is for; 0 where it does not matter."""
-    steps = said['segment_steps']
+def _segment_steps(description: dict[str, Any], name: str, delay: int) -> int:
+    """Steps of the segments that a description names; 0 if the policy does not see them."""
+    steps = description['segment_steps']
     if type(steps) is not int or steps not in (0, delay):
         raise NetworkError(
             f'{name}: its network description names segments of {steps!r} steps, where they have '
@@ -185,17 +187,17 @@ def _segment_steps(said: dict[str, Any], name: str, delay: int) -> int:
 
 
 def _check(tensors: dict[str, Tensor], expected: dict[str, Tensor], name: str) -> None:
-    """Refuse weights that do not fit, before anything is made of them."""
+    """Refuse weights that do not fit, before they are used."""
     if tensors.keys() != expected.keys():
         raise NetworkError(
             f'{name}: missing weights {sorted(expected.keys() - tensors.keys())}, '
             f'unknown weights {sorted(tensors.keys() - expected.keys())}'
         )
     for key, tensor in tensors.items():
-        came = (str(tensor.dtype), tuple(tensor.shape))
+        actual = (str(tensor.dtype), tuple(tensor.shape))
         due = ('torch.float32', tuple(expected[key].shape))
-        if came != due:
-            raise NetworkError(f'{name}: weight {key!r} is {came}, expected {due}')
+        if actual != due:
+            raise NetworkError(f'{name}: weight {key!r} is {actual}, expected {due}')
         strange = tensor.numel() - int(torch.isfinite(tensor).sum())
         if strange:
             raise NetworkError(

@@ -1,4 +1,4 @@
-"""The policy network: what the learner trains, and what simulators and the evaluator act with.
+"""The policy network, which the learner trains and with which simulators and the evaluator act.
 
 Between them it travels as a JSON description and safetensors bytes, never as a pickle. Shapes: B =
 batch, O = observation size, A = action size, H = width of a hidden layer.
@@ -16,8 +16,6 @@ from torch import Tensor, nn
 
 LOG_STD_RANGE = (-10.0, 2.0)
 """Hard clip of the log standard deviation (jaxrl)."""
-
-
 OBSERVATION_CLIP = 10.0
 """Standardised observations are clipped to this many deviations (baselines' VecNormalize)."""
 
@@ -38,9 +36,9 @@ def describe(
         observation_size: O of the task.
         action_size: A of the task.
         hidden: widths of the hidden layers.
-        segment_steps: steps n of a segment where the policy sees how far the segment is: (t - t_i)
-            / n for step t of a segment that began at t_i is then one more input; 0 where not.
-        kind: which network it is, a name in `KINDS`.
+        segment_steps: steps n of a segment if the policy sees how far the segment is, as one more
+            input: (t - t_i) / n for step t of a segment that began at t_i. 0 if it does not.
+        kind: the network's name in `KINDS`.
     """
     description = {
         'kind': kind,
@@ -85,10 +83,10 @@ class Actor(nn.Module):
 class StandardisedActor(nn.Module):
     """A Gaussian over actions before their squash by tanh, for standardised observations.
 
-    The standard deviation is the same in every state. The moments of the observations are no
+    The standard deviation is the same in every state. The moments of the observations are not
     parameters, but travel with them. Initial weights are orthogonal, with gain sqrt(2) in the
-    network and 0.01 for the mean (as baselines' MlpPolicy has them, recalled); biases and log
-    standard deviations are zero.
+    network and 0.01 for the mean (as in baselines' MlpPolicy, recalled); biases and log standard
+    deviations are zero.
     """
 
     constants = {'activation': 'tanh', 'observation_clip': OBSERVATION_CLIP}
@@ -114,7 +112,7 @@ KINDS: dict[str, type[Actor | StandardisedActor]] = {
     'tanh_gaussian_mlp': Actor,
     'standardised_tanh_gaussian_mlp': StandardisedActor,
 }
-"""Policy networks by the name that a description gives them."""
+"""Policy networks by their name in a description."""
 
 
 def layers(inputs: int, hidden: Sequence[int], activation: type[nn.Module]) -> nn.Sequential:

@@ -1,7 +1,7 @@
 """Compiling torch functions for this processor, with its C++ compiler, or for its GPU.
 
-What was built is kept and found again by the next run, in `cache_folder()`. This module imports
-torch only when something is compiled, so that `codetr doctor` can ask what is missing.
+The results are kept in `cache_folder()` for the next run. This module imports torch only to
+compile, so that `codetr doctor` can ask quickly what is missing.
 """
 
 import inspect
@@ -21,14 +21,14 @@ _Function = TypeVar('_Function', bound=Callable[..., object])
 
 
 class CompilationError(RuntimeError):
-    """Nothing can be compiled here: says why, what to install and how to do without."""
+    """Nothing can be compiled here: names the reason, what to install and how to do without."""
 
 
 def cache_folder() -> Path:
-    """Where compiled functions are kept: where torch's variable says, else in the user's cache."""
-    said = os.environ.get(_CACHE)
-    if said:
-        return Path(said)
+    """The folder of compiled functions: the one in torch's variable, else in the user's cache."""
+    chosen = os.environ.get(_CACHE)
+    if chosen:
+        return Path(chosen)
     caches = os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache'
     return Path(caches, 'codetr_ros', 'torch')
 
@@ -39,10 +39,10 @@ def command() -> str:
 
 
 def missing() -> str:
-    """What is needed to compile and is not here; empty if everything is."""
+    """What is needed to compile and is missing; empty if nothing is."""
     if shutil.which(command()) is None:
-        said = ' (environment variable CXX)' if os.environ.get('CXX') else ''
-        return f'there is no C++ compiler {command()!r}{said}'
+        source = ' (environment variable CXX)' if os.environ.get('CXX') else ''
+        return f'there is no C++ compiler {command()!r}{source}'
     header = Path(sysconfig.get_path('include'), 'Python.h')
     if not header.is_file():
         return f'the header {header} is missing'
@@ -55,11 +55,11 @@ def compiled(function: _Function, example: Sequence[Any], without: str) -> _Func
     Args:
         function: of tensors, without branches that depend on their values.
         example: its arguments; it is called with them.
-        without: the setting that makes do without compiling, and its value: for the error.
+        without: the setting, with its value, that avoids compiling: for the error.
 
     Raises:
-        CompilationError: a compiler or a header is missing, the compiler failed, or there is no
-            place to keep what was compiled.
+        CompilationError: a compiler or a header is missing, the compiler failed, or the result
+            cannot be kept.
     """
     lacking = missing()
     if lacking:
@@ -72,39 +72,39 @@ def compiled(function: _Function, example: Sequence[Any], without: str) -> _Func
     options: dict[str, Any] = {
         'fullgraph': True,
         'dynamic': False,
-        # For a CPU one C++ file for all, the calls of matrix products included: it is built sooner
-        # than a file for each kernel, and Python has nothing left to do between them.
+        # On a CPU one C++ file for all, calls of matrix products included: it builds faster than
+        # a file for each kernel, and leaves Python nothing to do between kernels.
         'options': {'cpp_wrapper': example[0].device.type == 'cpu'},
     }
-    # As often as there are learners in this process. A GPU machine may bring its own torch: an
-    # older one (2.11) has no such option, and compiles for as many as its recompile limit allows.
+    # For any number of learners in this process. A GPU machine may bring its own torch: an older
+    # one (2.11) lacks this option, and compiles for as many as its recompile limit allows.
     if 'isolate_recompiles' in inspect.signature(torch.compile).parameters:
         options['isolate_recompiles'] = True
     result = cast(_Function, torch.compile(function, **options))
     try:
         with warnings.catch_warnings():
-            # whoever wants fewer digits than float32 has chooses a precision in the settings
+            # fewer digits than those of float32 are chosen by a precision in the settings
             warnings.filterwarnings('ignore', message='TensorFloat32 tensor cores')
             result(*example)
     except TorchDynamoException as error:
-        said = str(error).split('Set TORCHDYNAMO_VERBOSE')[0].strip()
+        reason = str(error).split('Set TORCHDYNAMO_VERBOSE')[0].strip()
         device = example[0].device.type
         remedy = REMEDY if device == 'cpu' else f'see below what it needs for device={device}'
         raise CompilationError(
             f'torch could not compile {function.__qualname__}: {remedy}, or set {without}. '
-            f'It said: {said[-2000:]}'
+            f'Its error: {reason[-2000:]}'
         ) from error
     return result
 
 
 def _make_cache(without: str) -> None:
-    """Make the folder for what is compiled, and see whether it can be written to."""
+    """Make the folder for compiled functions, and check that it can be written to."""
     folder = cache_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
         raise CompilationError(
-            f'what is compiled cannot be kept in {folder} ({error.strerror}): set the environment '
-            f'variable {_CACHE} to a folder that can be written to, or set {without}'
+            f'compiled functions cannot be kept in {folder} ({error.strerror}): set the '
+            f'environment variable {_CACHE} to a folder that can be written to, or set {without}'
         ) from None

@@ -1,21 +1,21 @@
-"""Which devices torch can use here."""
+"""The devices that torch can use here."""
 
 import torch
 
 
 class DeviceError(ValueError):
-    """A device that is not here, or has no room: names value, field and remedy."""
+    """A device that is not available, or has no room: names value, field and remedy."""
 
 
 def usable(device: str, field: str = 'device') -> torch.device:
-    """A device by its name, once it is certain that torch can use it.
+    """A device by its name, after a check that torch can use it.
 
     Args:
         device: cpu, cuda, cuda:1, ...
         field: the setting that names it, for the error.
 
     Raises:
-        DeviceError: it cannot; says why, and what to do.
+        DeviceError: it cannot; names the reason and the remedy.
     """
     wanted = torch.device(device)
     if wanted.type == 'cpu':
@@ -25,7 +25,7 @@ def usable(device: str, field: str = 'device') -> torch.device:
         if torch.version.cuda is None and torch.version.hip is None:
             why, do = 'was built without CUDA', 'Install a build with it from pytorch.org'
         else:
-            why, do = 'finds no GPU', 'See what nvidia-smi says and CUDA_VISIBLE_DEVICES hides'
+            why, do = 'finds no GPU', 'See what nvidia-smi lists and CUDA_VISIBLE_DEVICES hides'
         raise DeviceError(f'{field}={device}: torch {torch.__version__} {why}. {do}, {remedy}')
     count, index = torch.cuda.device_count(), wanted.index or 0
     if index >= count:

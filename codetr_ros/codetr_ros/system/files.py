@@ -1,7 +1,7 @@
-"""How files get to the disk.
+"""Files that are written to the disk whole or not at all.
 
-Every file is written under a temporary name, synced to the disk and renamed, so that a reader (or
-a machine that lost its power) sees the whole old file or the whole new one, never a part.
+Every file is written under a temporary name, synced to the disk and renamed. A reader, or a
+machine that has lost its power, then sees the whole old file or the whole new one, never a part.
 """
 
 import os
@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 class FileError(OSError):
-    """A file that cannot be written: names it, the reason and the remedy."""
+    """A file that cannot be written: names the file, the reason and the remedy."""
 
     def __str__(self) -> str:
         return (
@@ -46,11 +46,11 @@ def atomic_write(path: Path, data: bytes | str) -> None:
     """Write a file whole or not at all: temporary name in the same folder, fsync, rename.
 
     Args:
-        path: the file; one that exists is replaced.
+        path: the file; an existing one is replaced.
         data: its content; text becomes UTF-8.
 
     Raises:
-        OSError: the disk is full or the folder cannot be written; `path` is then as it was.
+        OSError: the disk is full or the folder cannot be written; `path` is then unchanged.
     """
     content = data.encode() if isinstance(data, str) else data
     partial = path.with_name(f'.{path.name}.{os.getpid()}.partial')

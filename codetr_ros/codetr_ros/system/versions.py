@@ -1,4 +1,4 @@
-"""Versions of what decides the numbers of a run."""
+"""Versions of the software and hardware that decide the numbers of a run."""
 
 import platform
 from importlib import metadata
@@ -15,7 +15,7 @@ def version_of(*distributions: str) -> str | None:
 
 
 def versions() -> dict[str, str | None]:
-    """Versions of what decides the numbers of a run."""
+    """Versions of the software and hardware that decide the numbers of a run."""
     return {
         'python': platform.python_version(),
         'numpy': version_of('numpy'),
