@@ -98,7 +98,7 @@ def test_what_is_no_checkpoint_of_a_reward_model_is_refused(tmp_path):
     ):
         saved.read(tmp_path)
     path = checkpoints.save(tmp_path, 'other', 0, {}, {'task': 'x'})
-    with pytest.raises(CheckpointError, match="does not say 'settings': it is none of a reward"):
+    with pytest.raises(CheckpointError, match="lacks 'settings': it is not that of a reward"):
         saved.read(path)
 
 

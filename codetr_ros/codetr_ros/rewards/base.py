@@ -1,4 +1,4 @@
-"""What a reward method is: it turns composite rewards of segments into a reward for every step."""
+"""The base of reward methods, which turn the scores of segments into a reward for every step."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
@@ -17,7 +17,7 @@ from codetr_ros.system.states import check_state
 
 
 class RewardModelError(ValueError):
-    """A reward model cannot be asked, trained or restored: names value, field and remedy."""
+    """A reward model that cannot be used, trained or restored: names value, field and remedy."""
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,12 @@ class RewardMethod(ABC):
     """One way of making step rewards. Algorithm 1 knows reward methods by this class only.
 
     In each phase that is learnt from it calls `prepare`, then `gradient_step` as often as
-    `schedule` says, then `label_passes`: where `version` has risen of all segments, or of those
-    with the oldest labels (`relabel_steps`), or of those that will be drawn (`relabel`), and of
-    the new ones in any case.
+    `schedule` states, then `label_passes` for the new segments. Once `version` has risen, it also
+    labels all the others again, or those with the oldest labels (`relabel_steps`), or those that
+    will be drawn (`relabel`).
 
-    Labels are in the unit that `settings.reward_unit` asks for: in units of the target scale c
-    (`scaled`), or as the task gives them (`raw`).
+    Labels are in the unit of `settings.reward_unit`: in units of the target scale c (`scaled`), or
+    as the task gives them (`raw`).
 
     Args:
         settings: the run's settings.
@@ -49,11 +49,13 @@ class RewardMethod(ABC):
 
     name: ClassVar[str]
     in_process_only: ClassVar[bool] = False
-    """A reference that runs in process only: it sees what no node may see, or ignores scores."""
+    """Whether it is a reference for runs in process only: it sees what no node may see, or ignores
+    scores.
+    """
     needs_true_rewards: ClassVar[bool] = False
-    """Its memory must hold the environment's own rewards."""
+    """Whether its memory must hold the environment's own rewards."""
     context: int = 0
-    """Steps before a segment that `label` wants in its batches: pass it to `Segments.batch`."""
+    """Steps before a segment that `label` needs in its batches: pass it to `Segments.batch`."""
     label_batch: int = 256
     """Segments labelled at a time: how long a slice of labelling is."""
 
@@ -66,7 +68,7 @@ class RewardMethod(ABC):
 
     @property
     def schedule(self) -> Schedule:
-        """Gradient steps of a phase; none unless a method says otherwise."""
+        """Gradient steps of a phase; none unless a method overrides this."""
         return Schedule(0, 0)
 
     @property
@@ -76,25 +78,25 @@ class RewardMethod(ABC):
 
     @property
     def unit(self) -> float:
-        """What labels are multiplied by to be in the task's unit."""
+        """The factor by which labels are multiplied to be in the task's unit."""
         return self.target_scale if self._settings.reward_unit == 'scaled' else 1.0
 
     def prepare(self, memory: Trajectories) -> None:
-        """See the memory before a phase's gradient steps and labels.
+        """Look at the memory before a phase's gradient steps and labels.
 
-        The first time it freezes what stays as it is from then on, the target scale c among it;
-        `memory` holds a scored segment.
+        The first call freezes what never changes afterwards, such as the target scale c. `memory`
+        holds a scored segment.
         """
         if not self.target_scale:
             self.target_scale = memory.segments.target_scale(self._settings.target_scale)
 
     def gradient_step(self, memory: Trajectories, rng: np.random.Generator) -> dict[str, float]:
-        """Learn from one batch, drawn from `memory` with `rng`; nothing unless a method does.
+        """Learn from one batch, drawn from `memory` with `rng`; by default there is nothing to do.
 
-        What else is random (dropout) comes from torch's global generator, which the caller seeds.
+        Dropout draws from torch's global generator, which the caller seeds.
 
         Returns:
-            What there is to say about the step, by name.
+            Metrics of the step, by name.
 
         Raises:
             RewardModelError: not prepared, or training has diverged; nothing has changed then.
@@ -112,33 +114,33 @@ class RewardMethod(ABC):
         """
 
     def label_passes(self, memory: Trajectories, ids: NDArray[np.int64]) -> Iterator[F32]:
-        """Labels of the segments' steps one after the other, forward pass by forward pass."""
+        """Labels of the segments' steps in order, forward pass by forward pass."""
         batch = memory.segments.batch(ids, self.context)
         yield self.label(batch)[segment_steps(batch)]
 
     @property
     def single_steps(self) -> bool:
-        """Whether some steps of a segment are labelled at less cost than all: by `step_passes`."""
+        """Whether `step_passes` labels some steps of a segment at less cost than all of them."""
         return False
 
     def step_passes(
         self, memory: Trajectories, ids: NDArray[np.int64], within: NDArray[np.int64]
     ) -> Iterator[F32]:
-        """Labels of single steps, where `single_steps` says so, forward pass by forward pass.
+        """Labels of single steps, if `single_steps` is true, forward pass by forward pass.
 
         Args:
-            memory: holds them.
+            memory: holds the steps.
             ids: each step's segment.
             within: its number within the segment.
         """
         raise NotImplementedError(f'method {self.name!r} labels whole segments')
 
     def step_weights(self, batch: SegmentBatch) -> F32 | None:
-        """Weights w (B, L) by which the steps count for the score, where a method has such."""
+        """Weights w (B, L) of the steps in the score; None if the method has none."""
         return None
 
     def state(self) -> dict[str, torch.Tensor]:
-        """Everything that it takes to go on from here, in copies."""
+        """Copies of everything needed to go on from here."""
         return {'target_scale': torch.tensor(self.target_scale, dtype=torch.float64)}
 
     def load_state(self, state: Mapping[str, torch.Tensor]) -> None:
@@ -154,7 +156,7 @@ class RewardMethod(ABC):
         if not self.target_scale:
             raise RewardModelError(
                 f'method {self.name!r} has no target scale yet: '
-                'call prepare(memory) before it is trained or asked'
+                'call prepare(memory) before it is trained or used'
             )
 
 

@@ -1,4 +1,4 @@
-"""CoDeTr: a reward transformer, trained to make up composite rewards from step rewards.
+"""CoDeTr: a reward transformer, trained to compose composite rewards from step rewards.
 
 The formula beside its symbols: docs/methods.md#codetr.
 """
@@ -23,16 +23,16 @@ from codetr_ros.rewards.transformer import RewardTransformer
 class Codetr(SequenceMethod):
     """Learns R(segment) = sum_t w_t rhat_t by regression; labels steps with w_t rhat_t or rhat_t.
 
-    What the switches of `CodetrSettings` decide, beyond their descriptions:
+    The switches of `CodetrSettings`, beyond their descriptions:
 
-    * `context` 'episode' puts up to `window` steps before the segment, in training as in
+    * `context` 'episode' puts up to `window` steps before the segment, in training and in
       labelling; the loss and the labels are the segment's own in any case.
     * `attention_scope` 'window' lets all steps of the window attend to all. The weights of the
-      window's steps then sum to their number, and those of the segment to whatever falls to it.
-    * `labelling` 'window' takes the last `window` steps, be they of the segment or not, and keeps
-      the output of the last step only: with `label` 'rhat' as Preference Transformer does it, with
-      'product' its weight is the one that it has within that window. Where `context` is 'segment',
-      places beyond the delay are met in labelling only, untrained.
+      window's steps then sum to their number, and those of the segment to its share of that.
+    * `labelling` 'window' takes the last `window` steps, in the segment or not, and keeps only the
+      output of the last step. With `label` 'rhat' that is what Preference Transformer does; with
+      'product' the weight of the step is its weight within that window. If `context` is 'segment',
+      places beyond the delay occur in labelling only, untrained.
 
     Args:
         settings: the run's settings; the initial weights depend on its seed.
@@ -90,7 +90,7 @@ class Codetr(SequenceMethod):
             yield {'reward_loss': error / len(batch.values)}
 
     def _read_off(self, observations: Tensor, actions: Tensor, inside: Tensor) -> Tensor:
-        """With `label` 'product' those of a segment sum to its predicted composite reward."""
+        """Step rewards; with `label` 'product' they sum to a segment's predicted score."""
         weights, rewards = self.network(observations, actions, inside)
         labels: Tensor = weights * rewards if self._codetr.label == 'product' else rewards
         return labels

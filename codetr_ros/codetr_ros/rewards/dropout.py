@@ -1,6 +1,6 @@
-"""Dropout made fast on a CPU: masks from a generator that is cheap for each number it draws.
+"""Dropout made fast on a CPU: masks from a generator that is cheap for each number.
 
-On another device they come from its own generator.
+On another device masks come from its own generator.
 """
 
 from collections.abc import Sequence
@@ -13,15 +13,15 @@ CPU = torch.device('cpu')
 
 
 def keep_mask(shape: Sequence[int], dropout: float, device: torch.device = CPU) -> Tensor:
-    """What activations are multiplied with: 1 / (1 - dropout) where they are kept, else 0.
+    """A factor for each activation: 1 / (1 - dropout) where it is kept, else 0.
 
-    Each is kept independently of the others with probability 1 - dropout, to within 2^-32. What
-    is drawn is seeded by torch's global generators.
+    Each is kept independently of the others with probability 1 - dropout, to within 2^-32. The
+    draws are seeded by torch's global generators.
 
     Args:
         shape: of the mask.
         dropout: the probability of 0, below 1.
-        device: where it is wanted.
+        device: of the mask.
     """
     if device.type != 'cpu':
         return torch.empty(shape, device=device).bernoulli_(1 - dropout).mul_(1 / (1 - dropout))
@@ -42,7 +42,7 @@ def draw(count: int) -> Tensor:
 
 
 def add_dropped(h: Tensor, change: Tensor, dropout: float) -> Tensor:
-    """Add to h a change of which a part is dropped, both of one shape."""
+    """Add to h a change of the same shape, with dropout on the change."""
     if not dropout:
         return h + change
     return torch.addcmul(h, change, keep_mask(change.shape, dropout, change.device))

@@ -6,21 +6,21 @@ trajectory, and every one of its steps gets
 
     (R - R_min) / (R_max - R_min)    in [0, 1]
 
-What differs from the published code, and from how the authors of RBT ran it as a baseline, which
-is the better guide to the paper's table:
+Differences from the published code, and from the baseline that the authors of RBT ran, which is
+the better guide to the paper's table:
 
 * R is the segment's composite reward, as in RBT's baseline; the published code takes the
-  trajectory's mean reward. A segment cut short is so measured by a shorter sum.
+  trajectory's mean reward. A segment cut short is thus measured by a shorter sum.
 * R_min and R_max are over all segments ever seen, as in RBT's baseline; the published code has
   those of its present buffers.
 * Both normalise when the learner samples. Here labels are given once per phase, and anew to all
-  steps in a phase in which an extreme has moved: the learner meets the same numbers, since within
-  a phase nothing is scored.
+  steps in a phase in which an extreme has moved. The learner receives the same numbers, since
+  nothing is scored within a phase.
 * No heap of the best trajectories is sampled beside the memory, as in RBT's baseline.
 * Where all scores are equal, none is better than another: all labels are 0 (decided here).
 
-Labels are in [0, 1] by definition, so `target_scale` and `reward_unit` do not touch them. That
-they cannot be negative makes every step of survival worth something, whatever the scores say.
+Labels are in [0, 1] by definition, so `target_scale` and `reward_unit` do not touch them. Since
+they cannot be negative, every step of survival is worth something, whatever the scores are.
 
 The formula beside its symbols: docs/methods.md#ircr.
 """
@@ -46,7 +46,7 @@ class Ircr(RewardMethod):
     def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
         super().__init__(settings, observation_size, action_size)
         self._moves = 0
-        self._least = self._greatest = 0.0  # of no meaning before the first move
+        self._least = self._greatest = 0.0  # meaningless before the first move
 
     @property
     def version(self) -> int:

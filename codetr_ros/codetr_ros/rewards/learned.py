@@ -1,4 +1,4 @@
-"""What the methods with a network share: targets in units of c, standardised inputs, AdamW."""
+"""The base of methods with a network: targets in units of c, standardised inputs, AdamW."""
 
 import math
 from abc import abstractmethod
@@ -19,15 +19,15 @@ from codetr_ros.seeding import seed_torch
 from codetr_ros.system.devices import usable
 
 STD_FLOOR = 1e-2
-"""Least standard deviation by which an observation component is divided (decided here).
+"""The least standard deviation by which an observation component is divided (decided here).
 
-A component that stood still in the warm-up may move later: it must not drown the others then.
+A component that stood still in the warm-up may move later, and must not drown the others then.
 """
 
 CLIP = 10.0
 """Deviations at which standardised observations are cut off, if at all (decided here).
 
-A component that hardly moved in the warm-up may lie a thousand of its deviations away later.
+A component that hardly moved in the warm-up may later lie a thousand of its deviations away.
 """
 
 
@@ -35,26 +35,26 @@ class Learned(RewardMethod):
     """A method that fits a network to composite rewards by gradient steps.
 
     Inside, composite rewards are in units of the target scale c, the root mean square composite
-    reward per step of the warm-up: a positive constant, never a shift, so that what survival is
-    worth keeps its sign. The network sees observations standardised by the moments of the warm-up.
+    reward per step of the warm-up: a positive constant, never a shift, so that the worth of
+    survival keeps its sign. The network sees observations standardised by the moments of the
+    warm-up.
 
-    A subclass says what its network is, which terms its loss is the sum of, and which step
-    rewards it reads off.
+    A subclass defines its network, the terms of its loss, and the step rewards that it reads off.
 
-    The network lies on `device`, that of the setting `reward_device`; batches are made on the CPU
-    and copied there (but see `DeviceSteps`), labels come back. A state loads on any device.
+    The network lies on `device`, that of the setting `reward_device`. Batches are made on the CPU
+    and copied there (but see `DeviceSteps`), and labels come back. A state loads on any device.
 
     Raises:
         DeviceError: there is no such device here.
     """
 
     group: ClassVar[str]
-    """The group of settings that it is trained by."""
+    """The group of settings by which it is trained."""
     clip: ClassVar[float] = math.inf
     """Deviations from the mean beyond which standardised observations are cut off.
 
-    For networks that do not normalise their inputs themselves, as the transformer does, and where
-    observations are predicted.
+    Finite for networks that do not normalise their inputs themselves (the transformer does), and
+    where observations are predicted.
     """
 
     def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
@@ -95,7 +95,7 @@ class Learned(RewardMethod):
         """Step rewards (B, L) in units of c, of any value outside the segments."""
 
     def _parts(self, batch: SegmentBatch) -> Sequence[SegmentBatch]:
-        """The batch in as many parts as are looked at one after the other."""
+        """The batch in parts, to be processed one after the other."""
         return [batch]
 
     def _learning_rate(self) -> float:
@@ -130,32 +130,32 @@ class Learned(RewardMethod):
         self._require_prepared()
         self.network.train()
         self._optimiser.zero_grad()
-        said: dict[str, float] = {}
+        metrics: dict[str, float] = {}
         for terms in self._terms(memory, rng):
             torch.stack(list(terms.values())).sum().backward()  # type: ignore[no-untyped-call]
-            # read now only: on a GPU whoever reads waits
+            # read only now: on a GPU, reading waits for the result
             for name, term in terms.items():
-                said[name] = said.get(name, 0.0) + float(term.detach())
-        for name, value in said.items():
+                metrics[name] = metrics.get(name, 0.0) + float(term.detach())
+        for name, value in metrics.items():
             if not math.isfinite(value):
                 raise RewardModelError(
                     f'{name} is {value} at gradient step {self.gradient_steps}: training has '
                     f'diverged. Lower {self.group}.learning_rate = {self._own.learning_rate} '
-                    f'or set target_scale = rms'
+                    'or set target_scale = rms'
                 )
         rate = self._learning_rate()
         for group in self._optimiser.param_groups:
             group['lr'] = rate
         self._optimiser.step()
         self.gradient_steps += 1
-        return said | {'learning_rate': rate}
+        return metrics | {'learning_rate': rate}
 
     def label(self, batch: SegmentBatch) -> F32:
         """Step rewards (B, L) of the segments' steps, 0 elsewhere."""
         return self._in_unit(self._rewards(batch))
 
     def _in_unit(self, rewards: F32) -> F32:
-        """Step rewards in units of c in the unit of labels."""
+        """Convert step rewards from units of c to the unit of labels."""
         if self._settings.reward_unit == 'raw':
             return rewards * np.float32(self.target_scale)
         return rewards
@@ -180,7 +180,7 @@ class Learned(RewardMethod):
         return torch.tensor(values).to(self.device)
 
     def _standardised(self, observations: F32 | Tensor) -> Tensor:
-        """Observations as the network sees them, from an array or from what lies on the device."""
+        """Observations as the network sees them, from an array or a tensor on the device."""
         if not isinstance(observations, Tensor):
             observations = self._put(observations)
         standardised = (observations - self._mean) / self._std
@@ -218,9 +218,9 @@ class Learned(RewardMethod):
                 tensor.copy_(state[name])
 
     def _tensors(self) -> dict[str, Tensor]:
-        found = {}
+        tensors = {}
         for name, parameter in self.network.named_parameters():
-            found[f'network.{name}'] = parameter.data
+            tensors[f'network.{name}'] = parameter.data
             for moment, tensor in self._optimiser.state[parameter].items():
-                found[f'adamw.{moment}.{name}'] = tensor
-        return found
+                tensors[f'adamw.{moment}.{name}'] = tensor
+        return tensors

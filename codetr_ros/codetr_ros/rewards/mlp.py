@@ -1,8 +1,8 @@
 """A Markovian reward model: r(s, a) of each step by itself, trained on the sums of segments.
 
-It is a control, no published method: CoDeTr without a transformer and without weights. Where it
-does as well, no step's reward depended on the steps around it. Sizes, learning rate and weight
-decay are decided here, after the reward network of RRD; composite rewards, target scale,
+It is a control, not a published method: CoDeTr without a transformer and without weights. Where it
+does as well as CoDeTr, no step's reward depended on the steps around it. Sizes, learning rate and
+weight decay are decided here, after the reward network of RRD. Composite rewards, target scale,
 segments, batch and number of gradient steps are CoDeTr's.
 
 The formula beside its symbols: docs/methods.md#mlp.

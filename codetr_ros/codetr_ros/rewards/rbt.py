@@ -4,20 +4,20 @@ Tang et al., TMLR 2025 (arXiv 2402.03771): "reinforcement learning from bagged r
 
     R(segment) = sum_t z_t,    z_t = sum_j softmax_j(q_t k_j) v_j
 
-v_j is linear in the causal state of step j, and the softmax is bidirectional: CoDeTr's network,
-read in its rows where CoDeTr has its columns. The loss is the squared error of the sums plus that
-of the next observation, predicted from the causal state. Steps are labelled with z_t.
+v_j is linear in the causal state of step j, and the softmax is bidirectional. This is CoDeTr's
+network, with the rows of its attention read where CoDeTr reads the columns. The loss is the
+squared error of the sums plus that of the next observation, predicted from the causal state. Steps
+are labelled with z_t.
 
 The attention must see more than one segment. Within a single one sum_t z_t = sum_j w_j v_j, which
 is what CoDeTr predicts with the same weights: any credit inside the segment gives the same sum,
-and what is learnt is arbitrary. Where a window has several segments, each with a score of its own,
-z_t must attend to its surroundings. `rbt.attention_scope` 'segment' is there to show that.
+and the one that is learnt is arbitrary. Where a window has several segments, each with a score of
+its own, z_t must attend to its surroundings. `rbt.attention_scope` 'segment' exists to show that.
 
-What differs from the published code, as far as that could be read; the paper itself was not at
-hand:
+Differences from the published code, as far as it could be read; the paper itself was not at hand:
 
-* There a batch is 64 windows of 500 consecutive steps, which cross episodes and cut bags, a cut
-  bag being scored by its share. Here windows are runs of whole segments of one episode: as many as
+* There a batch is 64 windows of 500 consecutive steps. They cross episodes and cut bags, and a cut
+  bag is scored by its share. Here windows are runs of whole segments of one episode: as many as
   fit into `codetr.window` steps, two at least, that end with a segment drawn uniformly; and as
   many windows as make up `codetr.batch` segments (fewer where an episode has fewer before it).
 * There the loss on sums is divided by the number of steps, here by that of segments: it does not
@@ -27,11 +27,11 @@ hand:
 * There a step's label is the output of the last step of the window of H = 100 steps that ends with
   it, as here if `codetr.labelling` is 'window'. By default a segment's steps are labelled in one
   pass, from the window of segments that ends with theirs.
-* Composite rewards are in units of the target scale c and observations, the predicted ones too,
-  are standardised and cut off at 10 deviations. Architecture, attention scale, initial weights,
-  learning rate and number of gradient steps are by the settings `codetr`, so that RBT is compared
-  with CoDeTr and not with other settings. There it is one head, an unscaled attention, a learning
-  rate of 1e-4 that rises to 1e-3 and falls again, and four times as many gradient steps.
+* Composite rewards are in units of the target scale c. Observations, the predicted ones too, are
+  standardised and cut off at 10 deviations. Architecture, attention scale, initial weights,
+  learning rate and number of gradient steps follow the settings `codetr`, so that RBT is compared
+  with CoDeTr and not with other settings. The published code has one head, unscaled attention, a
+  learning rate of 1e-4 that rises to 1e-3 and falls again, and four times as many gradient steps.
 
 The formula beside its symbols: docs/methods.md#rbt.
 """
@@ -102,13 +102,13 @@ class Rbt(SequenceMethod):
 
 
 def places(sizes: list[int]) -> tuple[Tensor, Tensor]:
-    """Of segments in windows of so many: which window each is in, and which of its segments."""
+    """Each segment's window, and its place in it, for windows of these numbers of segments."""
     row = torch.repeat_interleave(torch.tensor(sizes))
     return row, torch.cat([torch.arange(size) for size in sizes])
 
 
 def side_by_side(each: Tensor, row: Tensor, place: Tensor) -> Tensor:
-    """Steps of segments (S, n, ...) in the windows they belong to (B, L, ...), 0 elsewhere.
+    """Steps of segments (S, n, ...), laid out in their windows (B, L, ...), 0 elsewhere.
 
     All segments but the last of a window are as long as the longest, so that its steps follow on
     each other and padding lies on the right.
@@ -119,14 +119,14 @@ def side_by_side(each: Tensor, row: Tensor, place: Tensor) -> Tensor:
 
 
 class BagTransformer(nn.Module):
-    """Steps of a window to their rewards z and the observations that follow them.
+    """Maps the steps of a window to their rewards z and the observations that follow them.
 
-    Its modules are called as those of `RewardTransformer`, whose weights fit it.
+    Its modules have the names of those of `RewardTransformer`, whose weights fit it.
 
     Args:
         observation_size: O.
         action_size: A.
-        positions: steps of the longest window that will ever come.
+        positions: steps of the longest window that can occur.
         settings: architecture and dropout.
     """
 
@@ -151,8 +151,7 @@ class BagTransformer(nn.Module):
             inside: (B, L) bool, the steps that attend to each other; at least one in each row.
 
         Returns:
-            z (B, L), 0 outside, and predicted observations (B, L, O), of no meaning in the
-            padding.
+            z (B, L), 0 outside, and predicted observations (B, L, O), meaningless in the padding.
         """
         x = self.causal(observations, actions)  # (B, L, d)
         attention = self.weights.attention(x, inside)  # (B, L, L)

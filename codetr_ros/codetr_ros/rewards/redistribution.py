@@ -1,8 +1,7 @@
 """Reward methods that learn nothing: the delayed reward as it is or spread, the truth, a constant.
 
 All of them state their rewards in the unit of the reward transformer (`target_scale`,
-`reward_unit`), so that what a learner makes of them differs by how rewards are distributed and by
-nothing else.
+`reward_unit`), so that results differ only by how rewards are distributed.
 
 The rules in a table: docs/methods.md#fixed-rules.
 """
@@ -71,7 +70,7 @@ class TrueReward(Redistribution):
 
 
 class Ones(Redistribution):
-    """A constant reward of 1 in any unit, whatever the scores say: what survival is worth."""
+    """A constant reward of 1 in any unit, whatever the scores are: the worth of survival alone."""
 
     name = 'ones'
     in_process_only = True

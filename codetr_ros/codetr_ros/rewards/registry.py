@@ -1,4 +1,4 @@
-"""Reward methods: from composite rewards to step rewards, each behind the same small protocol."""
+"""The reward methods, from composite rewards to step rewards, behind one small protocol."""
 
 from codetr_ros.config import Settings
 from codetr_ros.rewards.base import RewardMethod, RewardModelError
@@ -13,7 +13,7 @@ METHODS: dict[str, type[RewardMethod]] = {
     method.name: method
     for method in (Codetr, LastStep, Rbt, Rrd, Ircr, Mlp, Uniform, TrueReward, Ones)
 }
-"""Reward methods by the name that `settings.method` gives them."""
+"""Reward methods by their name in `settings.method`."""
 
 
 def kind(settings: Settings) -> type[RewardMethod]:

@@ -1,4 +1,4 @@
-"""RRD: randomized return decomposition, a sum learnt from random subsequences.
+"""RRD: randomized return decomposition, which learns a sum from random subsequences.
 
 Ren et al., ICLR 2022 (arXiv 2111.13485). A trajectory's mean reward per step is regressed on the
 mean of rhat over K of its steps, drawn at random, so that a long trajectory costs no more than a
@@ -7,18 +7,19 @@ short one. In the delayed setting each segment is a trajectory. `rrd.loss` choos
     biased      ( R/m - (1/K) sum_{t in I} rhat_t )^2          I: K of the m steps
     unbiased    the same less the variance of that mean over the draws of I, as estimated from I
 
-of which the second is in expectation what the mean over all steps would give, and the first is
-larger by that variance: it also asks for rewards that differ little within a segment.
+The second is in expectation the loss of the mean over all steps. The first is larger by that
+variance: it also favours rewards that differ little within a segment.
 
-What differs from the published code:
+Differences from the published code:
 
-* Segments in the place of whole trajectories, so that often K > m; then steps are drawn with
+* Segments take the place of whole trajectories, so that often K > m; then steps are drawn with
   replacement, as there.
 * There a gradient step of the reward net goes with every update of the policy learner, and rewards
   are computed as they are sampled. Here gradient steps come per phase, by default as many as a
-  phase has steps, and the learner meets labels of the phase's last net.
-* R in units of the target scale c and standardised observations, as all methods here; neither is
-  there. The difference s - s' is taken of the standardised ones, cut off at 10 deviations.
+  phase has steps, and the learner receives the labels of the phase's last net.
+* R is in units of the target scale c and observations are standardised, as in all methods here;
+  there neither is. The difference s - s' is that of the standardised ones, cut off at 10
+  deviations.
 * The learner is the SAC of all methods here.
 
 The published code has the network (input s, a, s - s'; Xavier weights), the learning rate, four
@@ -91,8 +92,8 @@ class Rrd(Learned):
 def draw_by_length(memory: Trajectories, rng: np.random.Generator, count: int) -> I64:
     """Ids of scored segments, drawn with replacement and in proportion to their lengths.
 
-    Each uniformly drawn one is kept with probability length / delay: no table of all lengths is
-    needed for it.
+    Each uniformly drawn one is kept with probability length / delay, which needs no table of all
+    lengths.
     """
     ids = memory.segments.ids()
     kept = np.empty(0, np.int64)
@@ -117,7 +118,7 @@ def decomposition_loss(
         rewards: rhat (B, K) of the steps drawn, K at least 2.
         returns: R/m (B,) of their segments.
         lengths: m (B,).
-        unbiased: take off what the variance of the mean over K steps adds in expectation. Its
+        unbiased: subtract what the variance of the mean over K steps adds in expectation. Its
             estimate is the sample variance over K, times 1 - K/m where steps are drawn without
             replacement.
     """

@@ -1,7 +1,7 @@
-"""Reward models that were saved, by a fit or in a run, and go on elsewhere: read, compared, used.
+"""Saved reward models, of a fit or a run: read, compared, and used elsewhere.
 
-A model means what it was trained to mean only under the settings that shape it and its labels.
-Where these differ, it is refused; how it was trained may differ.
+A model means what it was trained to mean only under the settings that shape it and its labels. It
+is refused where these differ; the settings of its training may differ.
 """
 
 import logging
@@ -21,7 +21,7 @@ from codetr_ros.runs.checkpoints import CheckpointError
 _log = logging.getLogger(__name__)
 
 ROLE = 'reward'
-"""Under which name reward models are saved."""
+"""The name under which reward models are saved."""
 _SHARED = ('method', 'target_scale', 'reward_unit')
 _OF_TRAINING = frozenset(
     [
@@ -31,7 +31,7 @@ _OF_TRAINING = frozenset(
         'subsequence_steps',
     ]
 )
-"""Settings of a reward model that neither its weights' shapes nor its labels depend on."""
+"""Settings of a reward model on which neither its weights' shapes nor its labels depend."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class SavedModel:
 
     @property
     def digest(self) -> str:
-        """`reward_model_sha256` of what is saved."""
+        """The `reward_model_sha256` of its tensors."""
         return checkpoints.digest(self.tensors)
 
 
@@ -54,7 +54,7 @@ def read(path: Path) -> SavedModel:
     """Read a reward model.
 
     Args:
-        path: a checkpoint's folder, or that of a fit or of a run: its newest one is taken then.
+        path: a checkpoint's folder, or that of a fit or a run, whose newest checkpoint is taken.
 
     Raises:
         CheckpointError: there is none, or it is damaged.
@@ -74,7 +74,7 @@ def read(path: Path) -> SavedModel:
         task = str(meta['task'])
     except KeyError as error:
         raise CheckpointError(
-            f'checkpoint {chosen} does not say {error}: it is none of a reward model'
+            f'checkpoint {chosen} lacks {error}: it is not that of a reward model'
         ) from None
     return SavedModel(chosen, tensors, settings, task, sizes)
 
@@ -87,8 +87,8 @@ def restore(
     Args:
         saved: the saved one.
         settings: under which it goes on.
-        observation_size: O of what it is to label.
-        action_size: A of what it is to label.
+        observation_size: O of the steps that it is to label.
+        action_size: A of the steps that it is to label.
 
     Raises:
         RewardModelError: it was trained for another size, method or shape, or has not been
@@ -112,7 +112,7 @@ def restore(
     method.load_state(saved.tensors)
     if not method.target_scale:
         raise RewardModelError(
-            f'checkpoint {saved.path} was saved before anything was scored: it knows nothing'
+            f'checkpoint {saved.path} was saved before anything was scored: it has learnt nothing'
         )
     for name, theirs, ours in (
         ('task', saved.task, settings.task),

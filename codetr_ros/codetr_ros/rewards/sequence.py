@@ -1,4 +1,4 @@
-"""What the methods with a transformer over the steps of a window share: CoDeTr and RBT."""
+"""The base of the methods with a transformer over the steps of a window: CoDeTr and RBT."""
 
 import math
 from abc import abstractmethod
@@ -20,16 +20,16 @@ from codetr_ros.rewards.learned import Learned
 from codetr_ros.system import freed_memory
 
 ARRAY_BYTES = 16 << 20
-"""Upper bound of one window's or several windows' activations of one kind, where more than one
-window is looked at: half of what the C library serves from memory that it has (`freed_memory`).
+"""The most bytes of activations of one kind, where several windows are processed at once: half of
+the largest block that the C library serves from memory it keeps (`freed_memory`).
 """
 DEVICE_ARRAY_BYTES = 1 << 30
-"""The same on another device than the CPU, which wants much to do at a time.
+"""The same on a device other than the CPU, which needs much work at a time.
 
 With an eighth of it an H200 labels 0.84 times as many steps a second (gpu_check in benchmarks/).
 """
 PART_WINDOWS = 65_535
-"""Most windows at a time: so many sequences CUDA's kernels for attention take."""
+"""The most windows at a time: as many sequences as CUDA's kernels for attention take."""
 
 
 class SequenceMethod(Learned):
@@ -39,7 +39,7 @@ class SequenceMethod(Learned):
         settings: the run's settings; the initial weights depend on its seed.
         observation_size: O.
         action_size: A.
-        context: steps before a segment that the network sees in training as in labelling.
+        context: steps before a segment that the network sees in training and in labelling.
         whole_window: whether these attend and are attended to within the sequence.
     """
 
@@ -73,7 +73,7 @@ class SequenceMethod(Learned):
                 yield self.label_windows(batch)
 
     def label_on_device(self, memory: Trajectories, ids: NDArray[np.int64]) -> F32:
-        """The same labels of whole segments, put together where the network lies."""
+        """The same labels of whole segments, put together on the network's device."""
         self._require_prepared()
         if self._on_device is None or self._on_device.memory is not memory:
             self._on_device = DeviceSteps(memory, self.device)
@@ -118,7 +118,7 @@ class SequenceMethod(Learned):
         return [batch.part(slice(i, i + size)) for i in range(0, windows, size)]
 
     def _part_count(self, windows: int, steps: int) -> int:
-        """Into how many parts windows of so many steps are cut."""
+        """The number of parts into which windows of so many steps are divided."""
         most = ARRAY_BYTES if self.device.type == 'cpu' else DEVICE_ARRAY_BYTES
         tokens = steps * (2 if self._codetr.tokens == 'pair' else 1)
         widest = max(4 * self._codetr.embedding, self._codetr.heads * tokens) * tokens * 4
@@ -135,7 +135,7 @@ class SequenceMethod(Learned):
         return learning_rate(self._codetr, self.gradient_steps)
 
     def _inputs(self, batch: SegmentBatch) -> tuple[Tensor, Tensor, Tensor]:
-        """Observations (B, L, O), actions (B, L, A) and who attends within the sequence (B, L)."""
+        """Observations (B, L, O), actions (B, L, A) and the steps that attend (B, L)."""
         step = np.arange(batch.actions.shape[1])
         inside = step < batch.lengths[:, None] if self._whole_window else segment_steps(batch)
         if len(step) > self._positions:

@@ -25,8 +25,8 @@ from codetr_ros.config import CodetrSettings
 from codetr_ros.rewards.dropout import add_dropped, keep_mask
 
 KERNELS = [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION, SDPBackend.MATH]
-"""Of torch's ways to attend all but cuDNN's, which makes a plan for every other number of windows:
-as the memory grows there is one in every phase.
+"""Torch's kernels for attention except cuDNN's, which makes a plan for each new number of windows:
+one in every phase while the memory grows.
 """
 
 
@@ -42,7 +42,7 @@ class CausalSelfAttention(nn.Module):
         self.out = nn.Linear(d, d)
 
     def forward(self, h: Tensor, every: int = 1) -> Tensor:
-        """Tokens (B, N, d) to what each `every`-th of them attends to, mixed (B, N/every, d)."""
+        """Tokens (B, N, d) to a mix of what each `every`-th attends to (B, N/every, d)."""
         b, n, d = h.shape
         size = d // self.heads
         if every == 1:
@@ -61,7 +61,7 @@ class CausalSelfAttention(nn.Module):
 def causal_attention(q: Tensor, k: Tensor, v: Tensor, dropout: float) -> Tensor:
     """Attention of queries (B, H, Q, c) to keys and values (B, H, N, c), N a multiple of Q.
 
-    Query i belongs to the last token of the i-th of Q equal parts, and sees those up to there.
+    Query i belongs to the last token of the i-th of Q equal parts, and sees the tokens up to it.
     With dropout it is written out: torch's own takes several times as long on a CPU.
 
     Returns:
@@ -100,17 +100,17 @@ class Block(nn.Module):
         dropout = self.dropout if self.training else 0.0
         mixed = self.attention(self.norm1(h), every)  # (B, N/every, d)
         h = add_dropped(h[:, every - 1 :: every], mixed, dropout)
-        # of rows, not windows: in place on a view would cost two copies on the way back
+        # on rows, not windows: in place on a view would cost two copies in the backward pass
         wide = self.widen(self.norm2(h).flatten(0, 1)).relu_()  # (B N/every, 4d)
         return add_dropped(h, self.narrow(wide).view(h.shape), dropout)
 
 
 class CausalTransformer(nn.Module):
-    """Steps to their causal states: x_t has seen what happened up to step t, nothing after it.
+    """Maps steps to causal states: x_t has seen everything up to step t and nothing after it.
 
     Tokens are `pair` (s_1, a_1, s_2, a_2, ...), read at the action, or `merged`, one for each
-    step. What is not read is left out of the last layer, where nothing depends on it. A step's
-    position is its place in the window, whatever its time in the episode.
+    step. The last layer leaves out the tokens that are not read: nothing depends on them there. A
+    step's position is its place in the window, whatever its time in the episode.
     """
 
     def __init__(
@@ -152,7 +152,7 @@ class CausalTransformer(nn.Module):
 
 
 class SequenceWeights(nn.Module):
-    """w_t: how much the steps of the sequence attend to step t, all of them together."""
+    """w_t: how much all steps of the sequence together attend to step t."""
 
     def __init__(self, settings: CodetrSettings) -> None:
         super().__init__()
@@ -166,8 +166,8 @@ class SequenceWeights(nn.Module):
         q, k = self.qk(x).chunk(2, -1)  # each (B, L, d)
         unseen = torch.zeros(inside.shape, device=x.device).masked_fill_(~inside, -math.inf)
         logits = self.scale * (q @ k.transpose(1, 2)) + unseen[:, None, :]  # (B, L, L)
-        found: Tensor = logits.softmax(-1) * inside[:, :, None]  # (B, L, L)
-        return found
+        attention: Tensor = logits.softmax(-1) * inside[:, :, None]  # (B, L, L)
+        return attention
 
     def forward(self, x: Tensor, inside: Tensor) -> Tensor:
         """Causal states (B, L, d) to weights (B, L) of the steps that are `inside` (B, L)."""
@@ -183,12 +183,12 @@ class UnitWeights(nn.Module):
 
 
 class RewardTransformer(nn.Module):
-    """Steps of a window to their weights w and rewards rhat.
+    """Maps the steps of a window to their weights w and rewards rhat.
 
     Args:
         observation_size: O.
         action_size: A.
-        positions: steps of the longest window that will ever come.
+        positions: steps of the longest window that can occur.
         settings: architecture and dropout.
     """
 
@@ -213,7 +213,7 @@ class RewardTransformer(nn.Module):
             inside: (B, L) bool, the steps that attend to each other; at least one in each row.
 
         Returns:
-            w (B, L), 0 outside, and rhat (B, L), of no meaning in the padding.
+            w (B, L), 0 outside, and rhat (B, L), meaningless in the padding.
         """
         x = self.causal(observations, actions)  # (B, L, d)
         return self.weights(x, inside), self.reward(x).squeeze(-1)
@@ -223,9 +223,9 @@ def initialise(network: nn.Module, settings: CodetrSettings) -> None:
     """Zero biases and normal weights.
 
     'gpt2' (standard deviation 0.02, and 0.02 / sqrt(2 layers) where a block adds to its input)
-    begins close to a function of each step alone, to which training adds what earlier steps have
-    to say. 'lecun' (variance 1/inputs, the default of the Flax modules of the published code of
-    this family) begins with steps thoroughly mixed, and credit then stays on the wrong steps of a
+    begins close to a function of each step alone, to which training adds the influence of earlier
+    steps. 'lecun' (variance 1/inputs, the default of the Flax modules in the published code of
+    this family) begins with steps thoroughly mixed. Credit then stays on the wrong steps of a
     segment, though its sum is right.
     """
     for module in network.modules():
