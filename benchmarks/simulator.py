@@ -8,8 +8,8 @@ give the median of the rounds, and the lowest and highest in brackets.
 
 Steps, for each Gymnasium MuJoCo task that has a name here, under the same random actions from the
 same starts (that all end in the same states is checked; resets are not timed):
-  - ours: `Episode.step`, with which simulators and the evaluator step: the scaled action, the
-    physics, observation, reward, termination, finite numbers, segments and scores
+  - ours: `EpisodeRunner.step`, with which simulators and the evaluator step: the scaled action,
+    the physics, observation, reward, termination, finite numbers, segments and scores
   - floor: the physics and the observation alone, `mj_step` with the task's frame skip and the
     environment's own `_get_obs`. Humanoid's observation has contact forces, so that its floor has
     `mj_rnePostConstraint` as well
@@ -47,7 +47,7 @@ from codetr_ros.policy.actor import Actor, linear_layers
 from codetr_ros.records import F32
 from codetr_ros.seeding import generator
 from codetr_ros.simulation import tasks
-from codetr_ros.simulation.episode import Episode
+from codetr_ros.simulation.episode import EpisodeRunner
 
 RESULTS = Path(__file__).parent / 'results'
 PACKAGES = ('mujoco', 'gymnasium', 'numpy', 'torch')
@@ -79,7 +79,7 @@ class Player:
 def ours(name: str) -> Player:
     """The loop of this project."""
     environment = tasks.make(name)
-    episode = Episode(environment, Settings(task=name))
+    episode = EpisodeRunner(environment, Settings(task=name))
 
     def play(actions: list[F32]) -> None:
         step = episode.step
@@ -134,7 +134,7 @@ def scaled(box: Any, actions: F32) -> list[F32]:
 def episodes(name: str, steps: int) -> Iterator[tuple[int, F32]]:
     """Seeds and actions of episodes under the random policy, of so many steps together."""
     environment = tasks.make(name)
-    episode = Episode(environment, Settings(task=name))
+    episode = EpisodeRunner(environment, Settings(task=name))
     seed = 0
     while steps > 0:
         episode.reset(seed)

@@ -168,7 +168,7 @@ def test_without_evaluations_it_has_finished_when_the_last_version_arrives():
         (permit(2, run_id='other'), "run 'other', this is run 'run'"),
         (permit(2, network=describe(5, 1, (16,))), 'another architecture'),
         (permit(2, weights=b''), 'are not safetensors'),
-        (permit(2, version=6), 'version=6.*version -1 to 5'),
+        (permit(2, version=6), 'version=6.*versions -1 to 5'),
         (
             EpisodeResult(
                 run_id='run',

@@ -10,7 +10,7 @@ from codetr_ros.records import INITIAL_VERSION, EpisodeResult, Record, RunSpec
 from codetr_ros.records.roles import subscribed
 from codetr_ros.runs.reports import CoreReport
 from codetr_ros.seeding import generator
-from codetr_ros.simulation.episode import Episode
+from codetr_ros.simulation.episode import EpisodeRunner
 from codetr_ros.simulation.permission import acting_policy, check_policy
 from codetr_ros.simulation.tasks import make
 
@@ -40,7 +40,7 @@ class Evaluator(Part):
         self._settings = settings
         self._name = name
         self._environment = make(settings.task)
-        self._episode = Episode(self._environment, settings)
+        self._episode = EpisodeRunner(self._environment, settings)
         self._waiting: deque[tuple[str, int, ActingPolicy | None]] = (
             deque()
         )  # purpose, version, policy

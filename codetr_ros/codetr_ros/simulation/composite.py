@@ -1,15 +1,15 @@
 """Composite delayed rewards: one number for the m <= n steps of a segment (the paper's R_co).
 
 The delay n cuts every episode, from its start, into segments of n steps; the last may be shorter
-and is scored by the same formula. All of it is float64. How certain each formula is: the
-supplement states the types and beta, not all of the formulas; signed squares follow from the
+and is scored by the same formula. All numbers are float64. How certain each formula is: the
+supplement states the types and beta, not all of the formulas. Signed squares follow from the
 negative scores in its Table 2, and the softmax reading of Max from its word "scaling parameter".
 The other maxima are variants by name.
 
 All formulas in a table: docs/methods.md#composite-rewards.
 """
 
-# ruff: noqa: ARG001  (every formula takes the same arguments, so that one is as good as another)
+# ruff: noqa: ARG001  (every formula takes the same arguments, so that they are interchangeable)
 
 import math
 from collections.abc import Callable
@@ -21,7 +21,7 @@ F64 = NDArray[np.float64]
 
 
 class CompositeError(ValueError):
-    """A composite reward that does not exist: the message names its type and what was wrong."""
+    """A composite reward that does not exist: names its type and the fault."""
 
 
 def _sum(rewards: F64, beta: float, delay: int) -> float:
@@ -42,9 +42,8 @@ def _square_sum(rewards: F64, beta: float, delay: int) -> float:
 
 def _max(rewards: F64, beta: float, delay: int) -> float:
     """Sum of softmax(beta r)_t r_t: between mean (beta -> 0) and maximum (beta -> infinity)."""
-    weights = np.exp(
-        beta * (rewards - rewards.max())
-    )  # at most 1, and 1 for the largest: nothing overflows
+    # at most 1, and 1 for the largest: nothing overflows
+    weights = np.exp(beta * (rewards - rewards.max()))
     return float(weights @ rewards / weights.sum())
 
 
@@ -73,7 +72,7 @@ COMPOSITES: dict[str, Callable[[F64, float, int], float]] = {
     'max_log_sum_exp': _max_log_sum_exp,
     'max_times_n': _max_times_n,
 }
-"""Each type by its name: a function of rewards (m,), beta and delay n."""
+"""The types by name: functions of rewards (m,), beta and delay n."""
 
 
 def composite(name: str, rewards: F64, beta: float, delay: int) -> float:

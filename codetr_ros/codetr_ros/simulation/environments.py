@@ -1,10 +1,9 @@
-"""Environments of either library behind one face: thin and fast.
+"""Environments of either library behind one interface: thin and fast.
 
-Every environment takes actions in [-1, 1] and gives float32 observations of one dimension. None
-ends an
-episode at its horizon by itself: whoever steps it does (see `episode`), so that a time limit is
-never mistaken for a terminal state. Gymnasium and DM Control are imported when an environment is
-made.
+Every environment takes actions in [-1, 1] and gives float32 observations of one dimension. It
+never ends an episode at its horizon: the code that steps it does (see `episode`), so that a time
+limit is never mistaken for a terminal state. Gymnasium and DM Control are imported when an
+environment is made.
 """
 
 import logging
@@ -30,12 +29,12 @@ class TaskError(ValueError):
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """What a name stands for.
+    """A task: an environment with a horizon and a unit of scores.
 
     Attributes:
-        name: how settings call it.
-        environment_id: how its library calls it.
-        library: whose environment it is.
+        name: its name in settings.
+        environment_id: the environment's name in its library.
+        library: the library that has the environment.
         horizon: steps after which an episode is truncated.
         r_max: the largest reward of one step, the unit of scores; positive.
         note: what to know about it.
@@ -53,12 +52,11 @@ class Environment(ABC):
     """An environment with actions in [-1, 1], float32 observations (O,), and no time limit.
 
     Attributes:
-        task: what it simulates.
+        task: the task that it simulates.
         name, horizon, r_max: those of the task.
         observation_size: O.
         action_size: A.
-        control_period: seconds of simulated time that a step takes; 0 where the environment does
-            not say.
+        control_period: seconds of simulated time that a step takes; 0 where unknown.
     """
 
     def __init__(
@@ -73,8 +71,8 @@ class Environment(ABC):
             if not np.isfinite(bounds).all():
                 raise TaskError(
                     f'task {task.name!r}: its action space has {field}={bounds.tolist()}: bounds '
-                    'must be finite, for actions in [-1, 1] to be scaled to them. `codetr '
-                    'tasks` lists the tasks that work'
+                    'must be finite, for actions in [-1, 1] to be scaled to them. `codetr tasks` '
+                    'lists the tasks that work'
                 )
         self.task = task
         self.name = task.name
@@ -90,7 +88,7 @@ class Environment(ABC):
         self._steps = 0
 
     def reset(self, seed: int) -> F32:
-        """Start an episode and observe (O,): the same seed, 0 to 2**32 - 1, the same start.
+        """Start an episode and observe (O,). The same seed, 0 to 2**32 - 1, gives the same start.
 
         Raises:
             TaskError: the observation is not finite, or not of the size that the environment
@@ -128,7 +126,7 @@ class Environment(ABC):
         return observation, reward, terminated
 
     def _check(self, observation: F32) -> None:
-        # takes a fifth of the time of a look at each, and is not finite where one of them is not
+        # a fifth of the time of a check of each number, and not finite where one of them is not
         if math.isfinite(observation.dot(observation)):
             return
         finite = np.isfinite(observation)
@@ -144,11 +142,11 @@ class Environment(ABC):
 
     @abstractmethod
     def _reset(self, seed: int) -> F32:
-        """An observation that is the caller's own."""
+        """The first observation, in memory of the caller's own."""
 
     @abstractmethod
     def _step(self, action: NDArray[Any]) -> tuple[F32, float, bool]:
-        """The same, with reward and termination, after an action (A,) within the bounds."""
+        """The next observation, reward and termination after an action (A,) within the bounds."""
 
     @abstractmethod
     def close(self) -> None:
@@ -163,7 +161,7 @@ class GymnasiumEnvironment(Environment):
 
         try:
             with _quiet():
-                # no checker, no time limit and no order enforcer: they would cost more than some
+                # no checker, time limit or order enforcer: they would cost more than some
                 # simulations do
                 self._env = gymnasium.make(task.environment_id, disable_env_checker=True).unwrapped
         except (gymnasium.error.Error, ImportError) as error:
@@ -180,8 +178,7 @@ class GymnasiumEnvironment(Environment):
             if not isinstance(space, gymnasium.spaces.Box) or not floats:
                 raise TaskError(
                     f'task {task.name!r}: its {field} space is {space}: only Box spaces can be '
-                    'used, of real numbers for actions. `codetr tasks` lists the tasks that '
-                    'work'
+                    'used, of real numbers for actions. `codetr tasks` lists the tasks that work'
                 )
         box = spaces['action']
         size = math.prod(spaces['observation'].shape)
@@ -229,7 +226,7 @@ class ControlSuiteEnvironment(Environment):
         super().__init__(task, size, box.minimum, box.maximum, float(self._env.control_timestep()))
 
     def _reset(self, seed: int) -> F32:
-        # all that a task of the suite draws comes from this generator
+        # everything that a task of the suite draws comes from this generator
         self._env.task.random.seed(seed)
         return _own(self._env.reset().observation['observations'])
 
@@ -242,11 +239,8 @@ class ControlSuiteEnvironment(Environment):
             raise TaskError(
                 f'task {self.name!r}, step {self._steps} of the episode: {error}'
             ) from error
-        return (
-            _own(step.observation['observations']),
-            float(step.reward),
-            False,
-        )  # these tasks have no terminal states
+        # these tasks have no terminal states
+        return _own(step.observation['observations']), float(step.reward), False
 
     def close(self) -> None:
         """Free what the environment holds."""
@@ -259,7 +253,7 @@ def _own(raw: NDArray[Any]) -> F32:
 
 
 def _period(env: Any) -> float:
-    """Seconds of simulated time that a step takes; 0 where the environment does not say."""
+    """Seconds of simulated time that a step takes; 0 where unknown."""
     for name in ('dt', 'tau'):
         value = getattr(env, name, None)
         if isinstance(value, (int, float)) and value > 0:
@@ -270,10 +264,10 @@ def _period(env: Any) -> float:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep from people what they can do nothing about while an environment is made.
+    """Suppress warnings about which a user can do nothing while an environment is made.
 
-    v4 is asked for on purpose (see Ant-v4), no display is needed, and both libraries' models use
-    attributes that MuJoCo has renamed. From then on MuJoCo warns through `logging`: by itself it
+    v4 is used on purpose (see Ant-v4), no display is needed, and both libraries' models use
+    attributes that MuJoCo has renamed. Afterwards MuJoCo warns through `logging`: by itself it
     would write a file MUJOCO_LOG.TXT into whatever folder the process runs in.
     """
     import mujoco

@@ -1,4 +1,4 @@
-"""Episodes, step by step: cut into segments and scored as they go.
+"""Runs episodes step by step, cut into segments that are scored on the way.
 
 Simulators and the evaluator share this code, so that a score means the same in both.
 """
@@ -8,10 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from codetr_ros.config import Settings
-from codetr_ros.records import (
-    F32,
-    EpisodeResult,
-)
+from codetr_ros.records import F32, EpisodeResult
 from codetr_ros.simulation.composite import composite, perfect_score
 from codetr_ros.simulation.tasks import Environment, check, r_max
 
@@ -25,12 +22,12 @@ class Score:
     value: float
 
 
-class Episode:
-    """One episode after another of an environment, each cut into segments from its start.
+class EpisodeRunner:
+    """Runs one episode after another in an environment, each cut into segments from its start.
 
-    An episode ends in a terminal state (`terminated`) or at the horizon (`truncated`); one that
-    reaches a terminal state with its last step at the horizon is terminated only. Its last segment
-    may be shorter and is scored too.
+    An episode ends in a terminal state (`terminated`) or at the horizon (`truncated`). One that
+    reaches a terminal state exactly at the horizon is terminated only. Its last segment may be
+    shorter and is scored too.
 
     Args:
         environment: the environment; this object steps it and nothing else may.
@@ -53,10 +50,10 @@ class Episode:
         )
         self._rewards = np.zeros(environment.horizon, np.float64)
         self.terminated = False
-        self.truncated = True  # nothing runs yet: begin with `reset`
+        self.truncated = True  # there is no episode yet: begin with `reset`
         self.observation: F32 = np.zeros(environment.observation_size, np.float32)
         self.length = 0
-        self._first_step = 0  # of the segment that runs
+        self._first_step = 0  # of the present segment
         self._due = 0  # length at which it is to be scored, unless the episode ends before
         self._composite_return = 0.0
 
@@ -66,7 +63,7 @@ class Episode:
         return self.terminated or self.truncated
 
     def reset(self, seed: int) -> None:
-        """Start another episode from the start that `seed` stands for."""
+        """Start another episode, from the start that `seed` determines."""
         self.observation = self._environment.reset(seed)
         self.terminated = self.truncated = False
         self.length = self._first_step = 0
@@ -84,7 +81,7 @@ class Episode:
             short, if any.
 
         Raises:
-            TaskError: the environment gave something that is not finite.
+            TaskError: the environment returned a number that is not finite.
             CompositeError: the segment's composite reward is not finite.
         """
         self.observation, reward, self.terminated = self._environment.step(action)
@@ -105,7 +102,7 @@ class Episode:
     def result(
         self, run_id: str, source: str, purpose: str, step: int, version: int, episode: int
     ) -> EpisodeResult:
-        """How the episode went. `source` to `episode` are the fields of the record."""
+        """The result of the episode. `source` to `episode` are the fields of the record."""
         return EpisodeResult(
             run_id=run_id,
             source=source,

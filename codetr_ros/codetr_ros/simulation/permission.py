@@ -1,4 +1,4 @@
-"""What a simulator and the evaluator check of a policy before they act under it."""
+"""The checks of a policy before a simulator or the evaluator acts under it."""
 
 from codetr_ros.config import Settings
 from codetr_ros.policy.acting import ActingPolicy, NetworkError
@@ -8,7 +8,7 @@ from codetr_ros.simulation.tasks import Environment
 
 
 def check_policy(policy: Record, run: RunSpec, settings: Settings, receiver: str) -> Policy:
-    """Refuse what is not a policy of this run.
+    """Refuse a record that is not a policy of this run.
 
     Raises:
         RecordError: another kind of record, another run, steps that do not match the sources, a
@@ -30,8 +30,8 @@ def check_policy(policy: Record, run: RunSpec, settings: Settings, receiver: str
         0 <= policy.phase <= last + settings.lag and INITIAL_VERSION <= policy.version <= last
     ):
         raise RecordError(
-            f'{describe(policy)}: this run has phase 0 to {last + settings.lag} and version '
-            f'{INITIAL_VERSION} to {last}: the learner must number them so'
+            f'{describe(policy)}: this run has phases 0 to {last + settings.lag} and versions '
+            f'{INITIAL_VERSION} to {last}: the learner must stay within them'
         )
     return policy
 
@@ -40,8 +40,8 @@ def acting_policy(policy: Policy, environment: Environment, delay: int) -> Actin
     """The policy to act with in an environment; None for the uniformly random one.
 
     Args:
-        policy: what the learner published.
-        environment: what it is to act in.
+        policy: the record that the learner published.
+        environment: where it is to act.
         delay: steps n of a segment.
 
     Raises:

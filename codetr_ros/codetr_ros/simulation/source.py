@@ -1,4 +1,4 @@
-"""A source: one environment, whose episodes become records, chunk by chunk."""
+"""A source: one environment whose episodes become records, chunk by chunk."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -20,30 +20,29 @@ from codetr_ros.records import (
     TrueRewards,
 )
 from codetr_ros.seeding import generator
-from codetr_ros.simulation.episode import Episode, Score
+from codetr_ros.simulation.episode import EpisodeRunner, Score
 from codetr_ros.simulation.tasks import TaskError, make, r_max
 
 CHUNK_STEPS = 250
-"""Most steps of a chunk: bounds how long an environment's part of a slice of work takes."""
+"""The most steps of a chunk: bounds the time of an environment's part of a slice of work."""
 
 
 def chunk_steps(observation_size: int, action_size: int) -> int:
-    """Most steps T of a chunk, so that (T+1, O) and (T, A) float32 fit; 0 if no step does."""
+    """The most steps T of a chunk such that (T+1, O) and (T, A) float32 fit; 0 if no step fits."""
     numbers = MESSAGE_BYTES // 4
     fitting = (numbers - observation_size) // (observation_size + action_size)
     return max(0, min(CHUNK_STEPS, fitting))
 
 
 class Source:
-    """One episode after another of an environment of its own.
+    """Runs one episode after another in an environment of its own.
 
-    What it draws depends on the run's seed, its own name, the phase and the episode, and on
-    nothing else.
+    Its draws depend only on the run's seed, its own name, the phase and the episode.
 
     Args:
         run: the run it belongs to.
         settings: the settings of the run.
-        name: its name, which must differ from every other source's of the run.
+        name: its name, which no other source of the run may have.
 
     Raises:
         TaskError: the task is unknown or cannot be used.
@@ -56,7 +55,7 @@ class Source:
         self.counters: Counter[str] = Counter()
         self._run = run
         self._settings = settings
-        self._episode = Episode(self.environment, settings)
+        self._episode = EpisodeRunner(self.environment, settings)
         sizes = self.environment.observation_size, self.environment.action_size
         self._chunk_steps = chunk_steps(*sizes)
         if not self._chunk_steps:
@@ -65,12 +64,12 @@ class Source:
                 f'actions takes more than the {MESSAGE_BYTES} bytes of a message: choose a task '
                 'with smaller observations'
             )
-        self._episodes = -1  # the number of the one that runs
+        self._episodes = -1  # number of the present one
         self._sequence = 0  # of the next chunk
         self._scores = 0  # scores given so far: the sequence number of the next
 
     def spec(self) -> TaskSpec:
-        """What is simulated."""
+        """The announcement of what this source simulates."""
         environment = self.environment
         return TaskSpec(
             run_id=self._run.run_id,
@@ -93,7 +92,7 @@ class Source:
             acting: the policy to act with; None acts uniformly at random.
         """
         steps = self.permitted(policy)
-        # for the whole phase at once: where its chunks begin and end does not change what is drawn
+        # for the whole phase at once, so that the division into chunks does not change the draws
         rng = generator(self._settings.seed, 'noise', self.name, policy.phase)
         size = self.environment.action_size
         draws = (
@@ -204,7 +203,7 @@ class Source:
         return t, records
 
     def _steps_at(self, policy: Policy, taken: int) -> int:
-        """Steps of the run, as if all sources were as far in the phase as this one."""
+        """Steps of the run, as if all sources were as far in the phase as this one is."""
         share = taken / self.permitted(policy)
         return policy.phase * self._settings.phase_steps + round(share * int(policy.steps.sum()))
 

@@ -1,4 +1,4 @@
-"""The tasks: what a name stands for, how long its episodes are, and what its best step earns.
+"""The tasks by name: their environments, the length of their episodes, and their best reward.
 
 Nothing heavy is imported before a task is made, so that listing and checking names is quick.
 """
@@ -37,8 +37,8 @@ def _dm_control(name: str, note: str) -> Task:
     )
 
 
-# The paper lists no r_max ("maximum possible reward in the environment"). Where the reward has no
-# bound, it is here what good policies reach per step; a score is to be read with it.
+# The paper lists no r_max ("maximum possible reward in the environment"). If the reward has no
+# bound, r_max is here what good policies reach per step: read scores with that in mind.
 _TASKS = (
     # Gym's reward threshold, 6000 in 1000 steps; SAC reaches 5.3 to 6.0
     _gymnasium(
@@ -81,7 +81,7 @@ TASKS: dict[str, Task] = {task.name: task for task in _TASKS}
 
 
 def find(name: str) -> Task:
-    """What a task's name stands for. Imports Gymnasium only for names that are not in `TASKS`.
+    """The task of a name. Imports Gymnasium only for names that are not in `TASKS`.
 
     Raises:
         TaskError: no such task, or one without a horizon.
@@ -96,7 +96,7 @@ def find(name: str) -> Task:
         raise TaskError(
             f'there is no task {name!r}{_close_to(name, gymnasium.registry)}. `codetr tasks` '
             'lists the tasks with a name; any Gymnasium id with Box spaces works as well. '
-            f'Gymnasium says: {error}'
+            f'Error of Gymnasium: {error}'
         ) from None
     if not spec.max_episode_steps:
         raise TaskError(
@@ -116,7 +116,7 @@ def find(name: str) -> Task:
 
 
 def _close_to(name: str, others: dict[str, Any]) -> str:
-    """Close matches among the tasks, for an error; those with a name of their own first."""
+    """Close matches among the tasks, for an error; those in `TASKS` first."""
     known = {known.lower(): known for known in [*others, *TASKS]}
     close = [known[match] for match in difflib.get_close_matches(name.lower(), known, n=4)]
     close.sort(key=lambda match: match not in TASKS)
@@ -152,5 +152,5 @@ def check(settings: Settings, task: Task | Environment) -> None:
 
 
 def r_max(settings: Settings, task: Task | Environment) -> float:
-    """The largest reward of a step, the unit of scores: the settings', or else the task's."""
+    """The largest reward of a step, the unit of scores: from the settings, else from the task."""
     return task.r_max if settings.r_max is None else settings.r_max
