@@ -1,4 +1,4 @@
-"""What is drawn from the memory D: labelled steps for SAC, segments for reward models."""
+"""Batches from the memory D: labelled steps for SAC, segments for reward models."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ class StepBatch:
     actions: F32  # (B, A)
     rewards: F32  # (B,) inferred step rewards
     next_observations: F32  # (B, O)
-    terminated: NDArray[np.bool_]  # (B,) nothing is bootstrapped from the next observation
+    terminated: NDArray[np.bool_]  # (B,) true: nothing is bootstrapped from the next observation
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -28,16 +28,16 @@ class SegmentBatch:
     lengths: I64  # (B,) steps in the window, context included
     context: I64  # (B,) leading steps that precede the segment
     values: F64  # (B,) the segment's composite reward; NaN for windows that only serve labelling
-    true_rewards: F32 | None = None  # (B, L), where the memory holds them: the oracle only
+    true_rewards: F32 | None = None  # (B, L) if the memory holds them, for the oracle only
 
     def part(self, rows: slice) -> 'SegmentBatch':
         """Some of the segments, in views of the same arrays."""
-        known = self.true_rewards
+        rewards = self.true_rewards
         return SegmentBatch(
             self.observations[rows],
             self.actions[rows],
             self.lengths[rows],
             self.context[rows],
             self.values[rows],
-            None if known is None else known[rows],
+            None if rewards is None else rewards[rows],
         )

@@ -1,8 +1,8 @@
-"""What a policy learner's updates of a phase will draw from the memory: no secret to anybody.
+"""The draws of a policy learner's updates from the memory, which the reward side can predict.
 
-An update's randomness depends on the run's seed, the phase and the update's place in it, and on
-nothing else. So the reward side, whose memory has the same steps and the same labels, knows what
-the learner is about to draw, and need not label what it will not see (`relabel` 'drawn').
+An update's randomness depends only on the run's seed, the phase and the update's place in it. So
+the reward side, whose memory has the same steps and the same labels, knows which steps the learner
+is about to draw, and need not label any others (`relabel` 'drawn').
 """
 
 from collections.abc import Iterator
@@ -18,8 +18,8 @@ from codetr_ros.seeding import generator
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Burst:
-    """Updates in a row, which draw from a stream of their own: neither interleaving nor a restart
-    changes what they draw.
+    """Updates in a row with a random stream of their own: neither interleaving nor a restart
+    changes their draws.
     """
 
     first: int  # the number of its first update within the phase
@@ -33,7 +33,7 @@ def updates_of(settings: Settings, phase: int) -> int:
 
 
 def bursts(settings: Settings, phase: int) -> Iterator[Burst]:
-    """The updates of a phase, as many at a time as `sac.burst` says."""
+    """The updates of a phase, `sac.burst` at a time."""
     due = updates_of(settings, phase)
     for first in range(0, due, settings.sac.burst):
         rng = generator(settings.seed, 'learner', phase, first)
@@ -41,14 +41,14 @@ def bursts(settings: Settings, phase: int) -> Iterator[Burst]:
 
 
 def drawn(settings: Settings, phase: int, memory: Trajectories) -> I64:
-    """What SAC's updates of a phase will draw from a memory, as its labelled steps are now.
+    """The steps that SAC's updates of a phase will draw, from the labelled steps as they are now.
 
     Returns:
         Places among the labelled steps (`LabelledSteps.draw`), ascending, each once.
     """
-    found = np.zeros(memory.labelled.count, np.bool_)
-    if len(found):
+    chosen = np.zeros(memory.labelled.count, np.bool_)
+    if len(chosen):
         for burst in bursts(settings, phase):
             for _ in range(burst.updates):
-                found[memory.labelled.draw(burst.rng, settings.sac.batch)] = True
-    return np.flatnonzero(found)
+                chosen[memory.labelled.draw(burst.rng, settings.sac.batch)] = True
+    return np.flatnonzero(chosen)

@@ -1,6 +1,6 @@
-"""Which labels of the memory are due, and how old those are that it holds.
+"""The labels of the memory that are due, and the ages of those that it holds.
 
-Ages are in versions of the model since then: in gradient steps, for a method that takes such.
+The age of a label is in versions of the model: in gradient steps, for a method that takes them.
 """
 
 import numpy as np
@@ -14,9 +14,9 @@ from codetr_ros.records import I64
 def segments_due(memory: Trajectories, version: int, settings: Settings) -> I64:
     """Segments to be labelled whole by a version of the model, in the order of their ids.
 
-    All that have no label, and with `relabel` 'all' of those with a label of another version all
-    (`relabel_steps` 0), or whole segments of at most so many steps, those with the oldest labels
-    first, among equals those with the lowest id; one at least.
+    Segments without a label are always due. With `relabel` 'all', those with a label of another
+    version are due too: all of them if `relabel_steps` is 0, else whole ones of at most so many
+    steps together, and one at least. The oldest labels come first, among equals the lowest ids.
     """
     ids = memory.segments.ids()
     versions = memory.segments.versions(ids)

@@ -16,7 +16,7 @@ class LabelledSteps:
     """The steps of a store that have a step reward.
 
     They are numbered source by source, in the order of names, and within a source by their slots.
-    Such a number is a step's place among them; it holds until the next change of the memory.
+    Such a number is a step's place among them. It is valid until the next change of the memory.
 
     Args:
         store: where the steps lie.
@@ -31,10 +31,10 @@ class LabelledSteps:
     # changing
 
     def apply(self, rewards: StepRewards) -> int:
-        """Store labels, and pass over those of episodes that were evicted.
+        """Store labels, except those of evicted episodes.
 
         Returns:
-            How many labels were passed over.
+            The number of labels that were left out.
 
         Raises:
             RecordError: a label is for steps that are not here; nothing is stored then.
@@ -75,11 +75,11 @@ class LabelledSteps:
         return int(np.count_nonzero(~keep))
 
     def forget(self) -> None:
-        """Drop the list of labelled steps: it is made anew when it is next asked for."""
+        """Drop the list of labelled steps: it is made anew when it is next needed."""
         self._slots = None
 
     # ------------------------------------------------------------------------------------------
-    # asking
+    # reading
 
     @property
     def count(self) -> int:
@@ -102,7 +102,7 @@ class LabelledSteps:
     def draw(self, rng: np.random.Generator, batch: int) -> I64:
         """Places (B,) among the labelled steps, drawn uniformly, with replacement.
 
-        What is drawn one after the other is the same in batches of any size.
+        Consecutive draws are the same in batches of any size.
 
         Raises:
             ValueError: no step is labelled.
@@ -137,11 +137,11 @@ class LabelledSteps:
         return result
 
     def located(self, places: I64) -> tuple[I64, I64]:
-        """Where labelled steps lie, given by their places among them.
+        """The segments of labelled steps, which are given by their places among them.
 
         Returns:
-            The id of each one's segment (B,), and its number within the segment (B,), ordered by
-            the one and then by the other.
+            The id of each step's segment (B,), and its number within the segment (B,), ordered by
+            both.
         """
         chosen = self._places()[places].astype(np.int64)
         ids, within = np.empty_like(chosen), np.empty_like(chosen)

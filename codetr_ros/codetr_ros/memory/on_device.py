@@ -1,18 +1,18 @@
-"""What is read of the memory D on a device: labelled steps by SAC, segments by a reward model.
+"""The steps of the memory D on a device: labelled ones for SAC, segments for a reward model.
 
-A step is one row there. What is new is copied in a few pieces, and what is drawn is gathered on
-the device. `DeviceMemory` holds for SAC
+A step is one row there. New steps are copied in a few pieces, and batches are gathered on the
+device. `DeviceMemory` holds for SAC
 
     s (O) | a (A) | s' (O) | gamma (1 - terminated) | label
 
 with s' spelt out, at 4 (2 O + A + 2) bytes a step: 0.9 GB for a million steps of Ant with 105
-observations. The rows are taken when the first ones come, for as many steps as each source may
-have. The labels are copied all together, as a reward model changes them all: 4 MB for a million.
-What was evicted has no label any more.
+observations. Room is made with the first steps, for as many as each source may have. The labels
+are all copied together, since a reward model changes all of them: 4 MB for a million. Evicted
+steps have no label any more.
 
 `DeviceSteps` holds observation and action, at 4 (O + A) bytes a step: 140 MB for a million of Ant.
-Gathering a million steps in whole segments takes half a second on a CPU, and all of them are
-labelled in every phase: so segments are put together on the device.
+Gathering a million steps in whole segments takes half a second on a CPU, and every phase labels
+all of them. Therefore segments are put together on the device.
 """
 
 from abc import ABC, abstractmethod
@@ -27,7 +27,7 @@ from codetr_ros.records import F32, I64
 from codetr_ros.system.devices import DeviceError
 
 COPIED_AT_ONCE = 65_536
-"""Steps that are put into rows in one go: more would take memory and save no time."""
+"""Steps that are put into rows at once: more would take memory and save no time."""
 
 
 class DeviceRows(ABC):
@@ -40,7 +40,7 @@ class DeviceRows(ABC):
         memory: the memory D, on the host.
         device: where the rows lie.
         setting: the setting that names the device.
-        bytes_per_step: what a step takes there.
+        bytes_per_step: memory of a step there.
     """
 
     rows: Tensor
@@ -67,10 +67,10 @@ class DeviceRows(ABC):
         return torch.split(self.rows, [ring.capacity for ring in rings])
 
     def _copy(self, rings: list[SourceRing]) -> bool:
-        """Take in the steps that are new in D.
+        """Copy the steps that are new in D.
 
         Returns:
-            Whether rows lie where they lay before.
+            Whether the rows have stayed where they were.
 
         Raises:
             DeviceError: the device has no room.
@@ -88,15 +88,15 @@ class DeviceRows(ABC):
     def _allocate(self, rings: list[SourceRing]) -> None:
         """Make room for all that the sources' rings can hold."""
         size = sum(ring.capacity for ring in rings)
-        self._take(0)  # the old rows go before the new ones come
+        self._take(0)  # frees the old rows before the new ones are made
         try:
             self._take(size)
-        except RuntimeError as error:  # torch's own where a GPU is out of memory
+        except RuntimeError as error:  # torch's error when a GPU is out of memory
             raise DeviceError(
                 f'{self._setting}={self._device}: no room for {size} steps of '
                 f'{self._bytes_per_step} bytes, memory_steps for each of {len(rings)} '
                 'environments: lower memory_steps, simulators or envs, or set '
-                f'{self._setting}=cpu. torch said: {error}'
+                f'{self._setting}=cpu. Error of torch: {error}'
             ) from error
         self._copied = [0] * len(rings)
 
@@ -116,10 +116,10 @@ class DeviceMemory(DeviceRows):
         self._discount = discount
 
     def update(self) -> bool:
-        """Take in what is new in D, and what is labelled differently or gone.
+        """Copy the steps that are new in D, and all labels, new or changed or gone.
 
         Returns:
-            Whether rows lie where they lay before.
+            Whether the rows have stayed where they were.
 
         Raises:
             DeviceError: the device has no room.
@@ -129,7 +129,7 @@ class DeviceMemory(DeviceRows):
         for ring, rows in zip(rings, self._blocks(rings), strict=True):
             labels = torch.from_numpy(ring.labels[: ring.used])
             rows[: ring.used, -1] = labels.to(self._device)
-        labelled = self.rows[:, -1].isfinite().nonzero().squeeze(1)  # the device is waited for
+        labelled = self.rows[:, -1].isfinite().nonzero().squeeze(1)  # waits for the device
         self._labelled[: len(labelled)] = labelled
         self._count.fill_(len(labelled))
         return stayed
@@ -147,10 +147,10 @@ class DeviceMemory(DeviceRows):
         return np.concatenate(parts, 1)
 
     def draw(self, batch: int) -> Tensor:
-        """Rows (B,) of labelled steps, uniform and with replacement, at least one being labelled.
+        """Rows (B,) of labelled steps, uniform and with replacement; one step must be labelled.
 
-        From the generator of the device. Odds are even up to (labelled steps) / 2^62: how many
-        steps are labelled is read on the device, so that a recorded draw follows it.
+        It draws from the device's generator. Odds are even up to (labelled steps) / 2^62: the
+        number of labelled steps is read on the device, so that a recorded draw follows it.
         """
         numbers = torch.randint(1 << 62, (batch,), device=self._device)
         return self._labelled[numbers % self._count]
@@ -184,7 +184,7 @@ class DeviceSteps(DeviceRows):
         super().__init__(memory, device, 'reward_device', 4 * sum(self._sizes))
 
     def update(self) -> None:
-        """Take in what is new in D.
+        """Copy the steps that are new in D.
 
         Raises:
             DeviceError: the device has no room.
@@ -206,7 +206,7 @@ class DeviceSteps(DeviceRows):
 
         Returns:
             Observations (B, L, O) before each step and actions (B, L, A), 0 in the padding on the
-            right, and which steps (B, L) there are, and which of them are the segments' own.
+            right; which steps (B, L) exist, and which of them are the segments' own.
         """
         places = np.stack(self.memory.segments.places(ids, context))  # (4, B)
         source, row, length, before = torch.from_numpy(places).to(self._device)[..., None]

@@ -1,4 +1,4 @@
-"""The steps of one source: where the memory D keeps its arrays."""
+"""The steps of one source, in the arrays of the memory D."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ class Rollout:
 
 @dataclass(slots=True)
 class StoredEpisode:
-    """Where an episode's steps lie."""
+    """The place of an episode's steps."""
 
     number: int
     start: int  # row of its first step
@@ -68,7 +68,7 @@ class SourceRing:
 
     @property
     def used(self) -> int:
-        """Rows that have ever held a step: those take memory."""
+        """Rows that have ever held a step: only these take memory."""
         return min(self.end, self.capacity)
 
     # ------------------------------------------------------------------------------------------
@@ -104,7 +104,7 @@ class SourceRing:
         self.terminated[rows[-1]] = chunk.terminated
 
     def evict_oldest(self) -> int:
-        """Drop the oldest episode with its segments; how many steps went."""
+        """Drop the oldest episode with its segments, and return its number of steps."""
         episode = self.episodes.popleft()
         del self.by_number[episode.number]
         rows = np.arange(episode.start, episode.start + episode.steps)
@@ -119,12 +119,12 @@ class SourceRing:
     # reading
 
     def slots_from(self, row: int, most: int) -> Iterator[I64]:
-        """Slots of the steps held from a row on, in order, at most so many at a time."""
+        """Slots of the steps held from a row on, in order, at most `most` at a time."""
         for start in range(max(row, self.start), self.end, most):
             yield np.arange(start, min(start + most, self.end)) % self.capacity
 
     def steps_in(self, slots: I64) -> StepBatch:
-        """The steps that lie in some slots (B,); NaN for a reward that is not there."""
+        """The steps in some slots (B,); their rewards are NaN where there is no label."""
         following = self.observations.take((slots + 1) % self.capacity, 0)
         for i in np.flatnonzero(self.last[slots]):
             row = self.start + (int(slots[i]) - self.start) % self.capacity

@@ -1,4 +1,4 @@
-"""Which segments may be scored: such as the steps in the store make up, and each once."""
+"""The segments that may be scored: they consist of steps in the store, and are scored once."""
 
 from collections.abc import Callable
 
@@ -7,7 +7,7 @@ from codetr_ros.memory.store import Store
 from codetr_ros.records import CompositeReward, RecordError
 
 Rule = Callable[[CompositeReward, StoredEpisode, int], str | None]
-"""Where segments of at most so many steps may lie: states what is wrong with one, if anything."""
+"""Where segments of at most so many steps may lie: returns the fault of one, if it has any."""
 
 
 def unscored(

@@ -1,7 +1,7 @@
-"""The scored segments of the memory D: which there are, where they lie, and batches of them.
+"""The scored segments of the memory D: their ids, their places, and batches of them.
 
 A segment has an id, (place of its source in the order of names << 40) | its number within the
-source. The arrays of ids (B,) that are asked about may be in any order.
+source. Arrays of ids (B,) may be in any order.
 """
 
 from collections.abc import Iterator
@@ -19,8 +19,8 @@ SOURCE_SHIFT = 40
 """Bits of an id that hold the number of the segment within its source."""
 
 Spans = list[tuple[str, I64, I64, I64]]
-"""For each source its name, and of each of its spans of steps the episode, the number of the first
-step within it, and how many steps there are."""
+"""For each source its name, and for each of its spans of steps the episode, the number of the
+first step within it, and the number of steps."""
 
 
 class Segments:
@@ -53,7 +53,7 @@ class Segments:
         self.forget()
 
     def forget(self) -> None:
-        """Drop the list of ids: it is made anew when it is next asked for."""
+        """Drop the list of ids: it is made anew when it is next needed."""
         self._ids = None
 
     # ------------------------------------------------------------------------------------------
@@ -70,7 +70,7 @@ class Segments:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of what is known of the segments."""
+        """Bytes of the tables of segments."""
         return sum(s.scored.nbytes(s.used) for s in self._store.sources)
 
     def scores(self, ids: I64) -> F64:
@@ -81,11 +81,11 @@ class Segments:
         return values
 
     def lengths(self, ids: I64) -> I64:
-        """Steps (B,) that the segments have."""
+        """The segments' numbers of steps (B,)."""
         return self._table(ids)[1]
 
     def versions(self, ids: I64) -> I64:
-        """The version (B,) of the model that labelled each one's first step; -1: none."""
+        """The version (B,) of the model that labelled each segment's first step; -1: none."""
         versions = np.empty(len(ids), np.int64)
         for _, source, mine, at in self._by_source(ids):
             slots = source.scored.rows[at] % source.capacity
@@ -94,7 +94,7 @@ class Segments:
         return versions
 
     def terminal(self, ids: I64) -> NDArray[np.bool_]:
-        """Which of them (B,) ended in a terminal state."""
+        """Which of the segments (B,) ended in a terminal state."""
         rows, lengths, _ = self._table(ids)
         terminal = np.empty(len(ids), np.bool_)
         for _, source, mine, _ in self._by_source(ids):
@@ -106,7 +106,7 @@ class Segments:
         """The unit c of composite rewards per step: positive, so that no sign ever changes.
 
         Args:
-            kind: 'rms', or else 1.
+            kind: 'rms'; with any other the unit is 1.
         """
         return self.score_scale() if kind == 'rms' else 1.0
 
@@ -127,8 +127,8 @@ class Segments:
         """Where the steps of segments lie, with up to `context` steps of the episode before each.
 
         Returns:
-            Of each (B,): the place of its source in the order of names, the row of the first step
-            in its ring, the number of steps, and how many of them are context.
+            For each (B,): the place of its source in the order of names, the row of the first step
+            in its ring, the number of steps, and the number of those that are context.
         """
         rows, lengths, offsets = self._table(ids)
         before = np.minimum(context, offsets)
@@ -147,7 +147,7 @@ class Segments:
         ]
 
     def step_spans(self, ids: I64, within: I64) -> Spans:
-        """Where single steps lie: one span for those of a segment that follow on each other.
+        """Where single steps lie: one span for consecutive steps of a segment.
 
         Args:
             ids: each step's segment, by source.
@@ -210,7 +210,7 @@ class Segments:
     def step_windows(
         self, ids: I64, within: I64, window: int, batch: int
     ) -> Iterator[SegmentBatch]:
-        """The same for single steps: each has its segment's id and its number within it."""
+        """The same for single steps, given by their segments' ids and their numbers in these."""
         firsts, _, offsets = self._table(ids)
         lengths = np.minimum(window, offsets + within + 1)
         rows = firsts + within + 1 - lengths
@@ -221,8 +221,8 @@ class Segments:
             yield self._gather(ids[part], rows[part], lengths[part], context[part], no_score)
 
     def _by_source(self, ids: I64) -> Iterator[tuple[int, SourceRing, I64, I64]]:
-        """For each source of some segments its place in the order of names and its ring, which of
-        the segments are its own, and where these stand in its table.
+        """For each source of some segments: its place in the order of names, its ring, the indices
+        of its own segments, and their places in its table.
         """
         rings = self._store.by_name()
         sources = ids >> SOURCE_SHIFT
@@ -232,7 +232,7 @@ class Segments:
             yield index, rings[index], mine, numbers - rings[index].scored.first
 
     def _table(self, ids: I64) -> tuple[I64, I64, I64]:
-        """The row of each one's first step, its steps, and the steps of its episode before it."""
+        """For each segment: its first step's row, its steps, and its episode's steps before it."""
         rows, lengths, offsets = np.empty((3, len(ids)), np.int64)
         for _, source, mine, at in self._by_source(ids):
             rows[mine] = source.scored.rows[at]
@@ -243,7 +243,7 @@ class Segments:
     def _gather(
         self, ids: I64, rows: I64, lengths: I64, context: I64, values: F64
     ) -> SegmentBatch:
-        """Steps from some rows on, of the sources of some segments."""
+        """The batch of the steps from these rows on, in the sources of these segments."""
         size, steps = len(ids), int(lengths.max())
         observations = np.empty((size, steps + 1, self._store.observation_size), np.float32)
         actions = np.empty((size, steps, self._store.action_size), np.float32)

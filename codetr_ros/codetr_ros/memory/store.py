@@ -1,4 +1,4 @@
-"""The steps of the memory D: a ring for each source, what may follow in it and what leaves it."""
+"""The steps of the memory D: a ring for each source, and the rules by which steps come and go."""
 
 from collections.abc import Iterable, Iterator, Sequence
 
@@ -8,7 +8,7 @@ from codetr_ros.memory.ring import Rollout, SourceRing, StoredEpisode
 from codetr_ros.records import F64, RecordError, Transitions, TrueRewards
 
 PART_ROWS = 1 << 16
-"""Rows that are converted to double precision at a time."""
+"""Rows converted to double precision at a time."""
 
 
 class Store:
@@ -66,7 +66,7 @@ class Store:
         self._sources[chunk.source] = source
 
     def _episode_of(self, source: SourceRing, chunk: Transitions) -> StoredEpisode:
-        """The episode that steps go on with or begin."""
+        """The episode that these steps go on with or begin."""
         last = source.newest
         expected = (0, 0)
         if last is not None:
@@ -104,19 +104,19 @@ class Store:
         The last episode of all is kept however long it is: an empty memory teaches nothing.
 
         Returns:
-            How many steps were dropped.
+            The number of steps dropped.
         """
         dropped = 0
         while self.steps > self.capacity and sum(len(s.episodes) for s in self.sources) > 1:
             ended = [s for s in self.sources if s.episodes and s.episodes[0].ended]
             if not ended:
-                break  # unfinished episodes are all there is: they must not be cut
+                break  # only unfinished episodes are left, which must not be cut
             oldest = min(ended, key=lambda s: s.episodes[0].order)
             dropped += oldest.evict_oldest()
         return dropped
 
     # ------------------------------------------------------------------------------------------
-    # asking
+    # reading
 
     @property
     def sources(self) -> list[SourceRing]:
@@ -155,7 +155,7 @@ class Store:
         Args:
             counts: how many of each source; fewer where fewer are held.
         """
-        # a source that has not taken any step yet is not among them
+        # a source without any step yet is not among them
         parts = [s.newest_steps(n) for s, n in zip(self.by_name(), counts, strict=False)]
         fields = Rollout.__dataclass_fields__
         return Rollout(*(np.concatenate([getattr(p, name) for p in parts]) for name in fields))

@@ -9,10 +9,10 @@ COLUMNS = ('rows', 'lengths', 'offsets', 'episodes', 'values', 'alive')
 
 
 class SegmentTable:
-    """Where a source's scored segments lie, and their composite rewards.
+    """The places of a source's scored segments, and their composite rewards.
 
     Segment number n stands at n - `first` of every column, of which `count` entries are in use.
-    The columns grow by a quarter; they move up when half of them is of evicted segments.
+    The columns grow by a quarter. They move up when half of them belongs to evicted segments.
 
     Args:
         capacity: slots of the source's ring: row r lies in slot r % capacity.
@@ -33,7 +33,7 @@ class SegmentTable:
         self._beginning = np.zeros(capacity, np.uint32)
 
     def nbytes(self, rows: int) -> int:
-        """Bytes in use, where the ring has so many rows in use."""
+        """Bytes in use if the ring has so many rows in use."""
         each: int = sum(getattr(self, name).itemsize for name in COLUMNS)
         return self.count * each + (rows * self._beginning.itemsize if self.count else 0)
 
@@ -52,7 +52,7 @@ class SegmentTable:
         return number - 1 if number else None
 
     def over(self, rows: I64) -> I64:
-        """Where in the table the segments stand that rows (B,) lie in; each lies in one."""
+        """The places in the table of the segments with these rows (B,), each of which has one."""
         table = np.flatnonzero(self.alive[: self.count])
         table = table[np.argsort(self.rows[table], kind='stable')]
         return table[np.searchsorted(self.rows[table], rows, side='right') - 1]
@@ -61,9 +61,9 @@ class SegmentTable:
         """Numbers of the whole segments that lie right before one in its episode, in order.
 
         Args:
-            at: where in the table that one stands.
+            at: the place of that one in the table.
             steps: of a whole segment.
-            most: how many are looked for.
+            most: the most to return.
         """
         row, first = int(self.rows[at]), int(self.offsets[at])
         numbers: list[int] = []

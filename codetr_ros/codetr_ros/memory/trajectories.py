@@ -1,8 +1,8 @@
 """The memory D: whole trajectories, their scored segments and their step rewards.
 
 Both the reward side and the learner keep one. Each observation is stored once; a step costs
-`Trajectories.bytes_per_step` bytes. What is added is checked against what is there, so that a
-wrong record is refused and changes nothing.
+`Trajectories.bytes_per_step` bytes. Records are checked against the content: a wrong one is
+refused and changes nothing.
 """
 
 from codetr_ros.memory.labelled import LabelledSteps
@@ -12,11 +12,11 @@ from codetr_ros.records import CompositeReward, StepRewards, Transitions, TrueRe
 
 
 class Trajectories:
-    """What has been simulated, scored and labelled, bounded by a number of steps.
+    """Everything simulated, scored and labelled, bounded by a number of steps.
 
-    What changes the memory is called here. What is in it is asked of its three parts: `store` has
-    the steps, `segments` those spans of steps that have a composite reward, and `labelled` the
-    steps that have a step reward.
+    The methods here change the memory. Its three parts give its content: `store` has the steps,
+    `segments` the spans of steps that have a composite reward, and `labelled` the steps that have
+    a step reward.
 
     Args:
         observation_size: O.
@@ -28,8 +28,8 @@ class Trajectories:
             episode.
         true_rewards: keep the environment's own rewards too, for the oracle.
         regular: segments have `delay` steps and follow on each other from an episode's first step
-            on, only its last is shorter. Else they may lie anywhere and have 1 to `delay` steps:
-            that no two share a step is for the caller to see to.
+            on, only its last is shorter. Else they may lie anywhere and have 1 to `delay` steps;
+            the caller must see to it that no two share a step.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Trajectories:
         self.segments.score(reward)
 
     def apply(self, rewards: StepRewards) -> int:
-        """Store labels; how many of them belong to evicted episodes and were passed over.
+        """Store labels, and return how many were left out because their episodes were evicted.
 
         Raises:
             RecordError: a label is for steps that are not here; nothing is stored then.
@@ -84,8 +84,8 @@ class Trajectories:
         return self.labelled.apply(rewards)
 
     def evict(self) -> int:
-        """Drop whole episodes, oldest first, until at most `capacity` steps are held; how many
-        steps went.
+        """Drop whole episodes, oldest first, until at most `capacity` steps are held, and return
+        the number of steps dropped.
 
         The last episode of all is kept however long it is: an empty memory teaches nothing.
         """
@@ -95,7 +95,7 @@ class Trajectories:
         return dropped
 
     def _forget(self) -> None:
-        """Let the parts work out anew what depends on the steps that are held."""
+        """Make the parts work out anew what depends on the steps held."""
         self.segments.forget()
         self.labelled.forget()
 
@@ -119,7 +119,7 @@ class Trajectories:
         return self.store.nbytes + self.segments.nbytes
 
     def report(self) -> dict[str, int]:
-        """What is held and what it takes, for a run's summary."""
+        """Steps held and memory taken, for a run's summary."""
         return {
             'steps': self.steps,
             'evicted': self.evicted,
