@@ -1,4 +1,4 @@
-"""What flows between the parts of a run: records, one kind for each message of `codetr_msgs`."""
+"""Records, which flow between the parts of a run: one kind for each message of `codetr_msgs`."""
 
 from codetr_ros.records.kinds import (
     F32,

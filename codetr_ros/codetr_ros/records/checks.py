@@ -1,4 +1,4 @@
-"""What a record must fulfil before any part of a run takes it in."""
+"""Checks of a record before any part of a run takes it."""
 
 import numpy as np
 
@@ -22,8 +22,7 @@ def check_run(record: Record, run: RunSpec) -> None:
     if record.run_id != run.run_id:
         raise RecordError(
             f'{describe(record)} is of run {record.run_id!r}, this is run {run.run_id!r}: stop '
-            'the other run, or give '
-            f'each run a namespace of its own'
+            'the other run, or give each run a namespace of its own'
         )
 
 
@@ -41,16 +40,14 @@ def check_transitions(chunk: Transitions, spec: TaskSpec) -> None:
         if chunk.steps < 1 or array.shape != expected:
             raise RecordError(
                 f'{describe(chunk)}: {name} have shape {array.shape}, {expected} expected of task '
-                f'{spec.task} as '
-                f'{spec.source!r} announced it'
+                f'{spec.task} as {spec.source!r} announced it'
             )
         bad = np.argwhere(~np.isfinite(array))
         if len(bad):
             step, component = bad[0].tolist()
             raise RecordError(
                 f'{describe(chunk)}: {name}[{step}, {component}] is {array[step, component]}: all '
-                'values must be finite; '
-                f'mend what {spec.source!r} publishes'
+                f'values must be finite; mend what {spec.source!r} publishes'
             )
     if chunk.first_step + chunk.steps > spec.horizon:
         raise RecordError(

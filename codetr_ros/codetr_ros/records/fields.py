@@ -1,6 +1,6 @@
-"""Records from the fields of messages that came from outside: over a topic or out of a bag.
+"""Records from the fields of messages, which come over a topic or from a bag.
 
-Lengths that must agree are checked here, once, for both.
+Lengths that must agree are checked here, once for both.
 """
 
 from typing import Any
@@ -24,7 +24,7 @@ PACKAGE = 'codetr_msgs'
 
 
 def type_name(record_type: type) -> str:
-    """The full name of the message type of a kind of record, as bags and services call it."""
+    """The full name of the message type of a kind of record, as in bags and services."""
     return f'{PACKAGE}/msg/{record_type.__name__}'
 
 
@@ -38,7 +38,7 @@ _PARALLEL: dict[type, tuple[tuple[str, ...], ...]] = {
     StepRewards: (('episodes', 'first_steps', 'lengths'),),
     Metrics: (('names', 'values'),),
 }
-"""Arrays that must be as long as the first of their row."""
+"""Names of arrays: each must be as long as the first of its row."""
 
 
 def record_of(record_type: type, values: dict[str, Any]) -> Record:
@@ -58,14 +58,14 @@ def record_of(record_type: type, values: dict[str, Any]) -> Record:
 
 
 def _refuse(record_type: type, values: dict[str, Any], field: str, expected: str) -> RecordError:
-    who = values.get('source') or values.get('node') or values.get('role') or 'its publisher'
-    where = ', '.join(
+    sender = values.get('source') or values.get('node') or values.get('role') or 'its publisher'
+    numbers = ', '.join(
         f'{name}={values[name]}' for name in ('sequence', 'phase', 'part') if name in values
     )
     return RecordError(
-        f'{record_type.__name__}({where}) from {who!r}: {field} has length '
+        f'{record_type.__name__}({numbers}) from {sender!r}: {field} has length '
         f'{len(values[field])}, expected {expected}; '
-        f'mend what {who!r} publishes on {TOPICS[record_type]!r}'
+        f'mend what {sender!r} publishes on {TOPICS[record_type]!r}'
     )
 
 

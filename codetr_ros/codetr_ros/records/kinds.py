@@ -1,10 +1,10 @@
-"""What flows between the parts of a run: one frozen dataclass for each message of `codetr_msgs`.
+"""The kinds of records: one frozen dataclass for each message of `codetr_msgs`.
 
 A record has the fields of its message, with the same names, in the same order (the message adds a
-`stamp`, which nothing learns from). Records know nothing of ROS; `codetr_ros.ros.messages` turns
-one into the other. Fields are given by name: many of them are neighbours of one type, and two that
-changed places would be noticed by nobody. Arrays are numpy; their shapes use T = steps,
-O = observation size, A = action size.
+`stamp`, from which nothing learns). Records know nothing of ROS; `codetr_ros.ros.messages` turns
+one into the other. Fields are given by name: many neighbours have one type, and two that changed
+places would go unnoticed. Arrays are numpy; their shapes use T = steps, O = observation size,
+A = action size.
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ PROTOCOL_VERSION = 1
 """Raised whenever a field changes its meaning; nodes of different versions refuse each other."""
 
 MESSAGE_BYTES = 200_000
-"""Most bytes of a message's arrays: the middleware's shared-memory segment holds 512 KB."""
+"""The most bytes of a message's arrays: the middleware's shared-memory segment holds 512 KB."""
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -33,12 +33,12 @@ phase k.
 
 
 class RecordError(ValueError):
-    """A record that must not be taken in: the message names value, field, source and remedy."""
+    """A record that must be refused: names value, field, source and remedy."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class RunSpec:
-    """What run this is, with every setting that its nodes share. From the learner to all."""
+    """The announcement of a run, with every setting that its nodes share. From learner to all."""
 
     run_id: str
     protocol_version: int
@@ -49,17 +49,17 @@ class RunSpec:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Presence:
-    """A node says that it is there: on start, once a second, and a last time when it has finished.
+    """Announces a node: on start, once a second, and a last time when it has finished.
 
-    `published` counts the records it has published so far on each of `topics`, so that whoever
-    listens can say what is missing; `missed` is what this node found missing so itself: records
-    that it was told were published on topics it reads and that have not reached it after a while.
+    `published` counts the records that it has published so far on each of `topics`, so that a
+    subscriber can count those it has not received. `missed` is this node's own count: records that
+    others have published on topics it reads, and that have not reached it after a while.
     """
 
     run_id: str
     role: str  # one of `roles.ROLES`
     node: str  # fully qualified node name; its last part names the sources where role is 'sim'
-    instance_id: str  # another one after each start of the process
+    instance_id: str  # a new one at each start of the process
     settings_hash: str  # empty while the node still waits for the run
     finished: bool
     topics: tuple[str, ...]
@@ -69,7 +69,7 @@ class Presence:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class TaskSpec:
-    """What a source simulates. From each simulator to all."""
+    """The task that a source simulates. From each simulator to all."""
 
     run_id: str
     protocol_version: int
@@ -87,7 +87,7 @@ class Policy:
     """The permission for one phase, with the policy to act under. From the learner to the
     simulators.
 
-    Steps that are all zero permit nothing: every phase of the run has been permitted before.
+    Steps that are all zero permit nothing: every phase of the run has already been permitted.
     """
 
     run_id: str
@@ -124,11 +124,11 @@ class Transitions:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class CompositeReward:
-    """The score of one segment. From whoever scores to recorder, reward or learner."""
+    """The score of one segment. From its scorer to recorder, reward or learner."""
 
     run_id: str
-    source: str  # whose segment it is
-    scorer: str  # who scored it
+    source: str  # the source of the segment
+    scorer: str  # the name of its scorer
     sequence: int  # 0, 1, 2, ... for each scorer
     episode: int
     first_step: int
@@ -138,7 +138,9 @@ class CompositeReward:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Commit:
-    """A phase is on disk, whole: exactly this belongs to it. Recorder to reward and learner."""
+    """Confirms that a phase is on disk, and names all that belongs to it. From recorder to reward
+    and learner.
+    """
 
     run_id: str
     phase: int
@@ -153,8 +155,8 @@ class Commit:
 class StepRewards:
     """New and changed labels after a phase, in parts. From reward to learner and recorder.
 
-    A row is a segment, whole the first time; later maybe some steps of it that follow on each
-    other (`relabel` 'drawn'), of which `first_steps` and `lengths` then speak.
+    A row is a segment, whole the first time. Later it may be some consecutive steps of one
+    (`relabel` 'drawn'), to which `first_steps` and `lengths` then refer.
     """
 
     run_id: str
@@ -171,7 +173,7 @@ class StepRewards:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class EpisodeResult:
-    """How one episode went. From simulators (training) and the evaluator to the recorder."""
+    """The result of one episode. From simulators (training) and the evaluator to the recorder."""
 
     run_id: str
     source: str
@@ -209,7 +211,7 @@ class Metrics:
     role: str
     node: str
     phase: int
-    step: int  # training steps taken in the run up to here
+    step: int  # training steps taken in the run so far
     names: tuple[str, ...]
     values: F64  # (len(names),)
 
