@@ -29,5 +29,5 @@ class RawMessage(NamedTuple):
     log_time: int  # [ns] when it was received
     publish_time: int  # [ns] the log time where the bag has none
     sequence: int  # as the file numbers it; 0 where it does not
-    data: bytes | memoryview  # CDR; a view is valid until the next message is asked for
+    data: bytes | memoryview  # CDR; a view is valid until the next message is read
     place: Place

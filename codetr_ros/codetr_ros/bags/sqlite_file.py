@@ -45,7 +45,7 @@ class SqliteFile:
         self._channels: dict[int, Channel] = {}
 
     def channels(self) -> list[Channel]:
-        """The topics that the file describes; empty before the first message is asked for."""
+        """The topics that the file describes; empty before the first message is read."""
         return list(self._channels.values())
 
     def messages(self) -> Iterator[RawMessage]:
