@@ -6,7 +6,7 @@ import pytest
 from codetr_ros.config import SettingsError
 from codetr_ros.cores.evaluator import Evaluator
 from codetr_ros.policy.acting import ActingPolicy
-from codetr_ros.policy.actor import Actor, describe, weights_bytes
+from codetr_ros.policy.actor import Actor, describe_network, weights_bytes
 from codetr_ros.records import EpisodeResult, RecordError
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.simulation import tasks
@@ -26,7 +26,7 @@ def permit(phase, lag=1, seed=0, **changes):
     """The policy of a phase of a run with two warm-up phases."""
     said = {'phase': phase, 'version': max(-1, phase - lag), 'random': phase < 2}
     if phase >= 2:
-        said['network'] = describe(*SIZES)
+        said['network'] = describe_network(*SIZES)
         said['weights'] = weights_bytes(fresh_actor(seed))
     return policy(**said | changes)
 
@@ -166,7 +166,7 @@ def test_without_evaluations_it_has_finished_when_the_last_version_arrives():
     ('wrong', 'message'),
     [
         (permit(2, run_id='other'), "run 'other', this is run 'run'"),
-        (permit(2, network=describe(5, 1, (16,))), 'another architecture'),
+        (permit(2, network=describe_network(5, 1, (16,))), 'another architecture'),
         (permit(2, weights=b''), 'are not safetensors'),
         (permit(2, version=6), 'version=6.*versions -1 to 5'),
         (

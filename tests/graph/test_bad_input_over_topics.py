@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS')
 
 from codetr_ros.config import Settings
-from codetr_ros.policy.actor import Actor, describe, weights_bytes
+from codetr_ros.policy.actor import Actor, describe_network, weights_bytes
 from codetr_ros.records import CompositeReward, Policy, Record
 from helpers.builders import policy, score, tiny, transitions
 from helpers.nodes import Nodes, Witness, domain
@@ -40,7 +40,7 @@ def of_another_architecture(settings: Settings) -> Policy:
         phase=settings.phases - 1,
         version=settings.phases - 1,
         random=False,
-        network=describe(OBSERVATION + 1, ACTION, hidden),
+        network=describe_network(OBSERVATION + 1, ACTION, hidden),
         weights=weights_bytes(Actor(OBSERVATION + 1, ACTION, hidden)),
     )
 
@@ -194,8 +194,10 @@ def test_a_policy_of_another_architecture_is_refused_naming_both(outcome, node):
     said = next(s for s in outcome.refusals(node, 'policy') if 'architecture' in s)
     settings = tiny()
     assert 'Policy(phase=5, version=5' in said
-    assert f'needs {describe(OBSERVATION, ACTION, settings.sac.hidden)}' in said
-    assert f'the policy is {describe(OBSERVATION + 1, ACTION, settings.sac.hidden)}' in said
+    assert f'needs {describe_network(OBSERVATION, ACTION, settings.sac.hidden)}' in said
+    assert (
+        f'the policy is {describe_network(OBSERVATION + 1, ACTION, settings.sac.hidden)}' in said
+    )
 
 
 def test_a_phase_that_is_permitted_twice_is_refused_by_the_simulator(outcome):

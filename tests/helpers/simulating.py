@@ -4,7 +4,7 @@ import numpy as np
 
 from codetr_ros.config import Settings
 from codetr_ros.cores.simulator import Simulator
-from codetr_ros.policy.actor import Actor, describe, weights_bytes
+from codetr_ros.policy.actor import Actor, describe_network, weights_bytes
 from codetr_ros.records import (
     Metrics,
     TrueRewards,
@@ -30,7 +30,7 @@ def learnt(task, seed=0):
     seed_torch(seed)
     actor = Actor(*sizes, (16, 16))
     weights = weights_bytes(actor)
-    return {'random': False, 'network': describe(*sizes, (16, 16)), 'weights': weights}
+    return {'random': False, 'network': describe_network(*sizes, (16, 16)), 'weights': weights}
 
 
 def slices(settings: Settings, policies, source='sim'):

@@ -13,7 +13,7 @@ from codetr_ros.policy.actor import (
     LOG_STD_RANGE,
     Actor,
     StandardisedActor,
-    describe,
+    describe_network,
     linear_layers,
     weights_bytes,
 )
@@ -40,7 +40,7 @@ def record(actor: Actor, **changes: object) -> Policy:
         sources=('sim',),
         steps=np.array([1000], np.uint32),
         random=False,
-        network=describe(OBS, ACT, HIDDEN),
+        network=describe_network(OBS, ACT, HIDDEN),
         weights=weights_bytes(actor),
     )
     return replace(policy, **changes)
@@ -132,12 +132,15 @@ def test_the_log_standard_deviation_is_clipped_on_both_sides(actor: Actor) -> No
 
 
 def test_the_description_is_canonical_json_that_names_sizes_and_widths() -> None:
-    description = describe(OBS, ACT, HIDDEN)
+    description = describe_network(OBS, ACT, HIDDEN)
     parsed = json.loads(description)
     assert parsed['observation_size'] == OBS and parsed['action_size'] == ACT
     assert parsed['hidden'] == list(HIDDEN)
     assert description == json.dumps(parsed, sort_keys=True, separators=(',', ':'))
-    assert len({describe(OBS, ACT, h) for h in (HIDDEN, HIDDEN[::-1], (32,), (32, 16, 16))}) == 4
+    assert (
+        len({describe_network(OBS, ACT, h) for h in (HIDDEN, HIDDEN[::-1], (32,), (32, 16, 16))})
+        == 4
+    )
 
 
 def stepwise(seen: np.ndarray, first: int, n: int) -> np.ndarray:
@@ -149,7 +152,7 @@ def stepwise(seen: np.ndarray, first: int, n: int) -> np.ndarray:
 def test_a_policy_that_sees_how_far_the_segment_is_counts_from_its_start() -> None:
     torch.manual_seed(3)
     actor = Actor(OBS + 1, ACT, HIDDEN)
-    published = record(actor, network=describe(OBS, ACT, HIDDEN, segment_steps=4))
+    published = record(actor, network=describe_network(OBS, ACT, HIDDEN, segment_steps=4))
     policy = ActingPolicy.from_record(published, OBS, ACT, delay=4)
     seen = observations(9)
     with torch.no_grad():
@@ -162,7 +165,7 @@ def test_a_policy_that_sees_how_far_the_segment_is_counts_from_its_start() -> No
 
 @pytest.mark.parametrize('named', ['4', '-4', '4.0', 'true', 'null', '"5"', '[5]'])
 def test_a_policy_for_other_segments_is_refused(named: str) -> None:
-    network = describe(OBS, ACT, HIDDEN, segment_steps=5).replace('s":5', f's":{named}')
+    network = describe_network(OBS, ACT, HIDDEN, segment_steps=5).replace('s":5', f's":{named}')
     published = record(Actor(OBS + 1, ACT, HIDDEN), network=network)
     with pytest.raises(NetworkError, match=r'segments of .* steps, where they have 5'):
         ActingPolicy.from_record(published, OBS, ACT, delay=5)
@@ -177,7 +180,7 @@ def test_the_moments_of_the_observations_travel_with_the_policy() -> None:
         actor.observation_mean.copy_(torch.linspace(-1, 1, OBS))
         actor.observation_deviation.copy_(torch.linspace(0.01, 2, OBS))  # some beyond the clip
     kind = 'standardised_tanh_gaussian_mlp'
-    published = record(actor, network=describe(OBS, ACT, HIDDEN, kind=kind))
+    published = record(actor, network=describe_network(OBS, ACT, HIDDEN, kind=kind))
     policy = ActingPolicy.from_record(published, OBS, ACT)
     seen = observations(9)
     noise = np.random.default_rng(1).standard_normal((9, ACT)).astype(np.float32)
@@ -196,7 +199,7 @@ def test_the_moments_of_the_observations_travel_with_the_policy() -> None:
 
 def test_a_policy_of_another_kind_is_another_architecture(actor: Actor) -> None:
     for kind in ('"gru"', '["gru"]', 'null', '"standardised_tanh_gaussian_mlp"'):
-        network = describe(OBS, ACT, HIDDEN).replace('"tanh_gaussian_mlp"', kind)
+        network = describe_network(OBS, ACT, HIDDEN).replace('"tanh_gaussian_mlp"', kind)
         with pytest.raises(NetworkError, match='another architecture'):
             ActingPolicy.from_record(record(actor, network=network), OBS, ACT)
 
@@ -207,12 +210,15 @@ def test_a_policy_for_another_task_is_refused_and_both_architectures_are_named(
     with pytest.raises(NetworkError) as refused:
         ActingPolicy.from_record(record(actor), OBS + 1, ACT)
     message = str(refused.value)
-    assert describe(OBS, ACT, HIDDEN) in message and describe(OBS + 1, ACT, HIDDEN) in message
+    assert (
+        describe_network(OBS, ACT, HIDDEN) in message
+        and describe_network(OBS + 1, ACT, HIDDEN) in message
+    )
     assert 'policy of phase 12, version 11' in message
 
 
 def test_another_activation_is_another_architecture(actor: Actor) -> None:
-    other = describe(OBS, ACT, HIDDEN).replace('relu', 'tanh')
+    other = describe_network(OBS, ACT, HIDDEN).replace('relu', 'tanh')
     with pytest.raises(NetworkError, match='another architecture'):
         ActingPolicy.from_record(record(actor, network=other), OBS, ACT)
 
@@ -226,7 +232,7 @@ def test_a_description_in_another_language_is_quoted(actor: Actor, network: str)
 
 @pytest.mark.parametrize('hidden', ['[]', '[0]', '[10000000]', '[1.5]', '["8"]', '[true]', '256'])
 def test_impossible_widths_are_refused_before_a_network_is_made(actor: Actor, hidden: str) -> None:
-    network = describe(OBS, ACT, HIDDEN).replace('[32,16]', hidden)
+    network = describe_network(OBS, ACT, HIDDEN).replace('[32,16]', hidden)
     with pytest.raises(NetworkError, match='names hidden widths'):
         ActingPolicy.from_record(record(actor, network=network), OBS, ACT)
 

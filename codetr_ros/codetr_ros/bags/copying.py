@@ -113,7 +113,7 @@ class _File:
 
 
 def copy(messages: Iterable[RawMessage], folder: Path, library: str) -> Copied:
-    """Write messages to a new bag, one file for each source file; `describe` makes it whole.
+    """Write messages to a new bag, one file for each source file; `write_metadata` makes it whole.
 
     Args:
         messages: in their order.
@@ -146,6 +146,6 @@ def copy(messages: Iterable[RawMessage], folder: Path, library: str) -> Copied:
     return made
 
 
-def describe(made: Copied, folder: Path) -> None:
+def write_metadata(made: Copied, folder: Path) -> None:
     """Write the metadata of a copied bag."""
     atomic_write(folder / METADATA, render(made.files, made.topics.values()))

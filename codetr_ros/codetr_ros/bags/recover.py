@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from codetr_ros.bags.copying import copy, describe
+from codetr_ros.bags.copying import copy, write_metadata
 from codetr_ros.bags.errors import BagError, Damage
 from codetr_ros.bags.raw import LIBRARY
 from codetr_ros.bags.reader import Bag
@@ -89,6 +89,6 @@ def recover(old: Path | str, new: Path | str) -> RecoveredBag:
                 f'no message of {old} can be read, {new} is not made: '
                 + (recovered.losses[0].text if recovered.losses else 'it holds none')
             )
-        describe(copied, folder)
+        write_metadata(copied, folder)
     recovered.verdict = verify(recovered.new)
     return recovered

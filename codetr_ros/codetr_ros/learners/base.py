@@ -37,7 +37,7 @@ class PolicyLearner(Protocol):
 
     @property
     def network(self) -> str:
-        """The description of the policy network, as `describe` makes it."""
+        """The description of the policy network, as `describe_network` makes it."""
 
     def train(self, phase: int, memory: Trajectories) -> Iterator[dict[str, float]]:
         """Learn from the memory once it has received a phase.

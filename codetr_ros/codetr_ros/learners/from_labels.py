@@ -11,7 +11,7 @@ from codetr_ros.learners.base import OffPolicy
 from codetr_ros.learners.device_sac import DeviceSAC
 from codetr_ros.learners.flat_sac import FlatSAC
 from codetr_ros.memory.trajectories import Trajectories
-from codetr_ros.policy.actor import Actor, describe
+from codetr_ros.policy.actor import Actor, describe_network
 
 
 class FromLabels(OffPolicy):
@@ -28,7 +28,7 @@ class FromLabels(OffPolicy):
     def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
         super().__init__(settings)
         self._sac = self._make(observation_size, action_size)
-        self.network = describe(observation_size, action_size, settings.sac.hidden)
+        self.network = describe_network(observation_size, action_size, settings.sac.hidden)
 
     def _make(self, observation_size: int, action_size: int) -> FlatSAC:
         settings = self._settings

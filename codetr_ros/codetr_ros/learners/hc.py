@@ -49,7 +49,7 @@ from codetr_ros.learners.base import LearnerError, OffPolicy, add
 from codetr_ros.learners.histories import HISTORIES, HistoryBatch, ScoredSteps
 from codetr_ros.learners.sac import Adam, q_values, squashed_gaussian, twin_critic
 from codetr_ros.memory.trajectories import Trajectories
-from codetr_ros.policy.actor import Actor, describe
+from codetr_ros.policy.actor import Actor, describe_network
 from codetr_ros.system.states import check_state
 
 
@@ -87,7 +87,7 @@ class HC(OffPolicy):
         self.target_scale = 0.0
         self._steps: ScoredSteps | None = None
         self._actor = Actor(observation_size + 1, action_size, sac.hidden)
-        self.network = describe(observation_size, action_size, sac.hidden, settings.delay)
+        self.network = describe_network(observation_size, action_size, sac.hidden, settings.delay)
         self.critic = Critic(settings, observation_size, action_size)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
         self.target_entropy = sac.target_entropy * action_size

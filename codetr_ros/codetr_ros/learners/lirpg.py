@@ -66,7 +66,13 @@ from codetr_ros.learners.on_policy import (
 )
 from codetr_ros.memory.ring import Rollout
 from codetr_ros.memory.trajectories import Trajectories
-from codetr_ros.policy.actor import StandardisedActor, describe, layers, orthogonal, standardise
+from codetr_ros.policy.actor import (
+    StandardisedActor,
+    describe_network,
+    layers,
+    orthogonal,
+    standardise,
+)
 from codetr_ros.records import F32
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.system.states import check_state
@@ -93,7 +99,7 @@ class PhaseBatch:
 
     observations: Tensor  # (T, O) standardised
     actions: Tensor  # (T, A)
-    squashed: Tensor  # (T, A) u, of which tanh is the action
+    squashed: Tensor  # (T, A) u; the action is tanh(u)
     log_probs: Tensor  # (T,) of u under the policy that acted
     rewards: Tensor  # (T,) R at the last steps of segments, scaled
     values: Tensor  # (T,) of mixed rewards, before the phase is learnt from
@@ -118,7 +124,7 @@ class Lirpg:
         self.updates = 0
         self.counters: Counter[str] = Counter()
         self.actor = StandardisedActor(observation_size, action_size, own.hidden)
-        self.network = describe(observation_size, action_size, own.hidden, kind=KIND)
+        self.network = describe_network(observation_size, action_size, own.hidden, kind=KIND)
         self.value = value_network(observation_size, own.hidden)
         self.extrinsic_value = value_network(observation_size, own.hidden)
         self.intrinsic_reward = value_network(observation_size + action_size, own.hidden)

@@ -1,9 +1,8 @@
 """Soft actor-critic (Haarnoja et al., arXiv 1812.05905) as jaxrl has it, in paper order.
 
-Where implementations differ, this one follows jaxrl: orthogonal initial weights with
-gain sqrt(2), the critics' output layer included; a hard clip of the log standard deviation; no
-factor 1/2 in the critic loss; a target entropy of -A/2; a temperature loss whose gradient goes
-through exp.
+Where implementations differ, this one follows jaxrl: orthogonal initial weights with gain sqrt(2),
+the critics' output layer included; a hard clip of the log standard deviation; no factor 1/2 in the
+critic loss; a target entropy of -A/2; a temperature loss whose gradient goes through exp.
 
 Shapes: B = batch, O = observation size, A = action size, H = width of a hidden layer. The two
 critics are a stack: each of their weights has a leading dimension of 2, and one batched product

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from codetr_ros.bags.copying import copy, describe
+from codetr_ros.bags.copying import copy, write_metadata
 from codetr_ros.bags.definitions import Definition, encode
 from codetr_ros.bags.errors import BagError
 from codetr_ros.bags.raw import LIBRARY, Channel, RawMessage
@@ -68,7 +68,7 @@ def label(bag: Bag, saved: SavedModel, folder: Path, memory_steps: int) -> Label
     messages = _messages(bag, index, method, found.found, memory_steps, made)
     with unfinished(folder, 'label again') as new:
         copied = copy(messages, new, f'labelled by {LIBRARY}')
-        describe(copied, new)
+        write_metadata(copied, new)
     return made
 
 

@@ -18,7 +18,7 @@ from codetr_ros.policy.actor import (
     LOG_STD_RANGE,
     Actor,
     StandardisedActor,
-    describe,
+    describe_network,
     linear_layers,
     standardise,
 )
@@ -41,7 +41,7 @@ class ActingPolicy:
 
     Args:
         actor: the network.
-        segment_steps: as in `describe`.
+        segment_steps: as in `describe_network`.
     """
 
     def __init__(self, actor: Actor | StandardisedActor, segment_steps: int = 0) -> None:
@@ -82,7 +82,7 @@ class ActingPolicy:
         segment_steps = _segment_steps(description, name, delay)
         named = description.get('kind')
         kind = next((kind for kind in KINDS if kind == named), 'tanh_gaussian_mlp')
-        expected = describe(observation_size, action_size, hidden, segment_steps, kind)
+        expected = describe_network(observation_size, action_size, hidden, segment_steps, kind)
         if policy.network != expected:
             raise NetworkError(
                 f'{name} is of another architecture: this task needs {expected}, '
@@ -155,7 +155,7 @@ def _parse(network: str, name: str) -> dict[str, Any]:
     except ValueError:
         raise NetworkError(
             f"{name}: its network description is not one of this version's: {network!r}; "
-            f'expected something like {describe(1, 1, [256, 256])}'
+            f'expected something like {describe_network(1, 1, [256, 256])}'
         ) from None
     return description
 

@@ -20,7 +20,7 @@ OBSERVATION_CLIP = 10.0
 """Standardised observations are clipped to this many deviations (baselines' VecNormalize)."""
 
 
-def describe(
+def describe_network(
     observation_size: int,
     action_size: int,
     hidden: Sequence[int],
