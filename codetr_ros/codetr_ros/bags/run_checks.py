@@ -44,7 +44,7 @@ class RunChecks:
         self.name = f'run {run_id!r} in {namespace}'
         self.sources: dict[str, SourceChecks] = {}
         self.phases = 0  # committed
-        self.whole = 0  # phases, from the first on, of which everything named is there
+        self.whole = 0  # phases, from the first on, that have all that their commits name
         self._ordered = ordered
         self._waiting: list[tuple[Commit, Any]] = []  # for what they name
         self._scorers: dict[str, Numbers] = {}

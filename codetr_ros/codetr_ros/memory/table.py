@@ -52,7 +52,7 @@ class SegmentTable:
         return number - 1 if number else None
 
     def over(self, rows: I64) -> I64:
-        """The places in the table of the segments with these rows (B,), each of which has one."""
+        """The place in the table of the segment that contains each of these rows (B,)."""
         table = np.flatnonzero(self.alive[: self.count])
         table = table[np.argsort(self.rows[table], kind='stable')]
         return table[np.searchsorted(self.rows[table], rows, side='right') - 1]

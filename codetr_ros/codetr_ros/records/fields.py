@@ -64,8 +64,8 @@ def _refuse(record_type: type, values: dict[str, Any], field: str, expected: str
     )
     return RecordError(
         f'{record_type.__name__}({numbers}) from {sender!r}: {field} has length '
-        f'{len(values[field])}, expected {expected}; '
-        f'mend what {sender!r} publishes on {TOPICS[record_type]!r}'
+        f'{len(values[field])}, expected {expected}; mend what {sender!r} publishes on '
+        f'{TOPICS[record_type]!r}'
     )
 
 
