@@ -26,8 +26,8 @@ def causal(messages: Iterable[MessageT], lag: int) -> Iterator[MessageT]:
     its labels after it, and steps after the commit that permits them.
 
     A recorder that receives topics like any other subscriber (`ros2 bag record`) may have mixed
-    the order between topics. A message that never comes is waited for until as many others are
-    held as such a recorder's queue takes.
+    the order between topics. The wait for a message that never comes ends when as many others are
+    held as the queue of such a recorder takes.
 
     Args:
         messages: of one run, each topic in its own order.

@@ -164,7 +164,7 @@ class Pace:
 class PlaybackReport(CoreReport):
     """What was played."""
 
-    phases: int = Field(description='phases of which all was played')
+    phases: int = Field(description='phases played whole')
 
 
 class Playback:
