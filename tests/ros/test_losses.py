@@ -236,7 +236,7 @@ def test_the_last_phases_keep_what_a_commit_names_once():
 def test_of_a_node_that_was_killed_and_started_again_only_the_newest_instance_counts():
     peers = Peers('record')
 
-    def said(instance, finished):
+    def presence(instance, finished):
         published = np.array([2], np.uint64)
         return Presence(
             run_id='run',
@@ -250,11 +250,11 @@ def test_of_a_node_that_was_killed_and_started_again_only_the_newest_instance_co
             missed=0,
         )
 
-    peers.hear(said('killed', False), 1.0)
+    peers.note(presence('killed', False), 1.0)
     assert peers.anybody_left()
-    peers.hear(said('started again', False), 2.0)
+    peers.note(presence('started again', False), 2.0)
     assert peers.anybody_left()
-    peers.hear(said('started again', True), 3.0)
+    peers.note(presence('started again', True), 3.0)
     assert not peers.anybody_left()
-    assert [peer.said.instance_id for peer in peers.newest()] == ['started again']
-    assert peers.told() == {'metrics': 4}  # what both have said
+    assert [peer.presence.instance_id for peer in peers.newest()] == ['started again']
+    assert peers.published() == {'metrics': 4}  # by both

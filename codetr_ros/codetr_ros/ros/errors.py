@@ -1,14 +1,14 @@
-"""Errors of nodes, and which errors say by themselves what is wrong."""
+"""Errors of nodes, and which errors need no traceback to be understood."""
 
 
 class NodeError(RuntimeError):
-    """The node cannot go on: the message names who or what is in the way and the remedy."""
+    """The node cannot go on: the message names the obstacle and the remedy."""
 
 
 def explains_itself(error: BaseException) -> bool:
-    """Whether an error was raised to be read: each subsystem of this package has a class of its
-    own, whose message names value, source and remedy. Any other error is a fault of the program,
-    and only its traceback tells where.
+    """Whether an error was raised to be read. Each subsystem of this package has an error class of
+    its own, whose message names value, source and remedy. Any other error is a fault of the
+    program, and only its traceback shows where.
     """
     return any(kind.__module__.split('.')[0] == 'codetr_ros' for kind in type(error).__mro__)
 

@@ -1,8 +1,8 @@
-"""End the process at a given time with a given exit code, whatever holds the interpreter then.
+"""End the process at a given time with a given exit code, even if the interpreter hangs then.
 
 A signal that ends a process gives it no exit code, and handlers and threads written in Python wait
 for the interpreter. A POSIX timer runs a C function in a thread of its own: here libc's `_exit`,
-which takes the timer's value for the exit code. See timer_create(2) and sigevent(7).
+which takes the timer's value as the exit code. See timer_create(2) and sigevent(7).
 """
 
 import ctypes
@@ -14,7 +14,7 @@ _SIGEV_THREAD = 2
 
 
 class _SigEvent(ctypes.Structure):
-    """`struct sigevent` of Linux: 64 bytes, of which what follows the attributes is unused."""
+    """`struct sigevent` of Linux: 64 bytes; those after the attributes are unused."""
 
     _fields_ = [
         ('value', ctypes.c_ssize_t),  # union sigval: the function's only argument
@@ -27,18 +27,18 @@ class _SigEvent(ctypes.Structure):
 
 
 class _TimerSpec(ctypes.Structure):
-    """`struct itimerspec`: the interval (0: once) and the time until the first end."""
+    """`struct itimerspec`: the interval (0: once) and the time until it first fires."""
 
     _fields_ = [(name, ctypes.c_long) for name in ('again_s', 'again_ns', 'first_s', 'first_ns')]
 
 
 def start(seconds: int, code: int) -> None:
-    """End this process with `_exit(code)` after some seconds. Nothing stops the timer but its end.
+    """End this process with `_exit(code)` after some seconds. Only an earlier end stops the timer.
 
     Raises:
-        OSError: The system has no timer to give.
+        OSError: the system has no timer left.
     """
-    for stream in (sys.stdout, sys.stderr):  # `_exit` does not
+    for stream in (sys.stdout, sys.stderr):  # `_exit` does not flush
         stream.flush()
     c = ctypes.CDLL('librt.so.1', use_errno=True)  # part of libc itself since glibc 2.34
     c_exit = ctypes.cast(ctypes.CDLL(None)['_exit'], ctypes.c_void_p)

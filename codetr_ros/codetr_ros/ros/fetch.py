@@ -1,4 +1,4 @@
-"""Fetches a committed phase again from the recorder, for a node that has not got all of it."""
+"""Fetches a committed phase again from the recorder, for a node that lacks some of it."""
 
 import time
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from codetr_ros.ros import messages
 from codetr_ros.ros.link import Link
 
 SERVICE = 'fetch_phase'
-AFTER = 3.0  # [s] for what is still under way
+AFTER = 3.0  # [s] for messages that are still under way
 AGAIN = 5.0  # [s] until the next try
 
 
@@ -22,35 +22,34 @@ def unpack(response: Any) -> list[Record]:
     """The records of a response.
 
     Raises:
-        RecordError: lengths that disagree, or a type that is no record.
+        RecordError: lengths disagree, or a type is no record.
     """
     lengths = list(response.lengths)
     if len(lengths) != len(response.types) or sum(lengths) != len(response.cdr):
         raise RecordError(
             f'{SERVICE}: {len(response.types)} types, {len(lengths)} lengths of {sum(lengths)} '
-            f'bytes and '
-            f'{len(response.cdr)} bytes disagree: update the recorder'
+            f'bytes and {len(response.cdr)} bytes disagree: update the recorder'
         )
     data = bytes(response.cdr)
-    found = []
+    records = []
     ends = np.cumsum(lengths, dtype=np.int64)
     for kind, length, end in zip(response.types, lengths, ends.tolist(), strict=True):
         if kind not in RECORD_TYPES:
             raise RecordError(f'{SERVICE}: {kind!r} is not a type of record: update the recorder')
         message_type = messages.message_type(RECORD_TYPES[kind])
-        found.append(
+        records.append(
             messages.from_message(deserialize_message(data[end - length : end], message_type))
         )
-    return found
+    return records
 
 
 class Fetcher:
-    """Asks the recorder when a phase stays incomplete.
+    """Asks the recorder for a phase that stays incomplete.
 
     Args:
         link: the node's connection.
         run_id: the run.
-        receive: takes each record that comes.
+        receive: takes each record that arrives.
     """
 
     def __init__(self, link: Link, run_id: str, receive: Callable[[Record], None]) -> None:
@@ -66,7 +65,7 @@ class Fetcher:
         """Ask for a phase that has been incomplete for a while.
 
         Args:
-            missing: the committed phase that is not whole, None if there is none.
+            missing: the committed phase that is incomplete, None if there is none.
         """
         now = time.monotonic()
         if missing != self._missing:

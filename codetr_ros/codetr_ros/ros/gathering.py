@@ -1,4 +1,4 @@
-"""Waits until nothing is lacking: the run, then everybody whom it needs, there and matched."""
+"""Waits until nothing is lacking: the run first, then all its nodes, present and matched."""
 
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -9,18 +9,18 @@ from codetr_ros.ros.errors import NodeError
 from codetr_ros.ros.membership import Membership
 from codetr_ros.ros.patience import NAME_EVERY
 
-IDLE = 0.05  # [s] blocked in the executor while there is nothing to do: the longest a signal waits
+IDLE = 0.05  # [s] to block in the executor when idle: the longest that a signal waits
 
 
 def wait_for(member: Membership, lacks: Callable[[], Sequence[str]]) -> bool:
-    """Wait until nothing is lacking, logging what is. False if asked to stop meanwhile.
+    """Wait until nothing is lacking, and log what still is. False if asked to stop meanwhile.
 
     Args:
-        member: who waits.
-        lacks: what is lacking now, in words.
+        member: the node that waits.
+        lacks: returns what is lacking now, in words.
 
     Raises:
-        NodeError: the same was lacking for longer than the parameter `peer_deadline`.
+        NodeError: the same things were lacking for longer than the parameter `peer_deadline`.
     """
     began = named = time.monotonic()
     while not member.stop:
@@ -30,7 +30,7 @@ def wait_for(member: Membership, lacks: Callable[[], Sequence[str]]) -> bool:
             return True
         now = time.monotonic()
         doing = f'waits for {"; ".join(lacking)}'
-        if doing != member.doing:  # somebody has come: the others have their time anew
+        if doing != member.doing:  # a node arrived: the deadline starts anew for the others
             member.doing = doing
             began = named = now
         if member.deadline and now - began > member.deadline:
@@ -47,12 +47,12 @@ def wait_for(member: Membership, lacks: Callable[[], Sequence[str]]) -> bool:
 def absent_or_unmatched(
     member: Membership, settings: Settings, settings_hash: str, matched: Collection[str]
 ) -> list[str]:
-    """Who is not there yet, or else not matched yet with our topics, in words.
+    """Names the nodes that are absent or, if none is, those not matched yet with our topics.
 
     Args:
-        member: who asks.
-        settings: of the run.
-        settings_hash: what peers with the same settings publish.
+        member: the node that asks.
+        settings: the settings of the run.
+        settings_hash: the hash that peers with these settings publish.
         matched: roles whose nodes must be matched.
     """
     absent = member.peers.absent(settings, settings_hash)
@@ -62,7 +62,7 @@ def absent_or_unmatched(
     def names(table: Mapping[str, Sequence[str]]) -> Callable[[str], set[str]]:
         def of(topic: str) -> set[str]:
             wanted = [r for r in table[topic] if r in matched and r in settings.roles]
-            return {peer.said.node for role in wanted for peer in member.peers.alive(role)}
+            return {peer.presence.node for role in wanted for peer in member.peers.alive(role)}
 
         return of
 

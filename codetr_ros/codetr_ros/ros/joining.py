@@ -1,4 +1,4 @@
-"""How a node joins a run: know it, take its settings, make the core."""
+"""How a node joins a run: it learns of the run, takes its settings and makes the core."""
 
 import secrets
 import sys
@@ -18,29 +18,29 @@ from codetr_ros.ros.membership import Membership
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.simulation import tasks
 
-NAME_PATIENCE = 2.0  # [s] for the name of a node whose topics are known
+NAME_PATIENCE = 2.0  # [s] until the name of a node with known topics is known
 
 MakeCore = Callable[..., Core[Any]]
-"""Makes the core of a node: (run, settings, name within the run, folder of checkpoints or None),
-and by name those of the node's own parameters that `parameters.core_parameters` lists."""
+"""Makes the core of a node from (run, settings, name within the run, folder of checkpoints or
+None) and, by name, the node's own parameters that `parameters.core_parameters` lists."""
 
 LoadCore = Callable[[], MakeCore]
-"""Imports what is slow to import (seconds) and returns what makes the core. Called once the run is
-known, so that a learner announces its run before, and all import at the same time."""
+"""Does the slow imports (seconds) and returns what makes the core. Called once the run is known:
+a learner announces its run first, and then all nodes import at the same time."""
 
 Announce = Callable[[Membership], tuple[RunSpec, Settings]]
-"""Decides what run it is, of a node that announces it."""
+"""Decides what run it is, in the node that announces it."""
 
 
 @dataclass(frozen=True)
 class Joined:
-    """What a node has once it has joined a run.
+    """What a node has after joining a run.
 
     Attributes:
         run: the run.
         settings: its settings.
         core: the node's part of the run.
-        folder: the folder of the run, where the node was given one.
+        folder: the folder of the run; None if the node was given none.
     """
 
     run: RunSpec
@@ -50,7 +50,7 @@ class Joined:
 
 
 def refuse_in_process_only(who: str, settings: Settings) -> None:
-    """Refuse a method that is no node's business.
+    """Refuse a method that nodes cannot run.
 
     Raises:
         NodeError: the method runs in process only.
@@ -58,17 +58,16 @@ def refuse_in_process_only(who: str, settings: Settings) -> None:
     if settings.method in IN_PROCESS_ONLY:
         raise NodeError(
             f'{who}: method = {settings.method!r} {IN_PROCESS_ONLY[settings.method]}, so that it '
-            'runs in process only: use '
-            f'`codetr train --in-process --method {settings.method}`, or start the learner with '
-            f'another method'
+            f'runs in process only: use `codetr train --in-process --method {settings.method}`, '
+            'or start the learner with another method'
         )
 
 
 def refuse_idle_reward(who: str, role: str, settings: Settings) -> None:
-    """Refuse a reward node where nobody wants step rewards.
+    """Refuse a reward node in a run without step rewards.
 
     Raises:
-        NodeError: the policy is learnt from the scores themselves.
+        NodeError: the learner learns from the scores themselves.
     """
     if role == 'reward' and role not in settings.roles:
         raise NodeError(
@@ -81,7 +80,7 @@ def refuse_used_folder(who: str, folder: Path, settings: Settings) -> None:
     """Refuse a folder that holds another run.
 
     Raises:
-        NodeError: its settings are not ours, or there are checkpoints in it.
+        NodeError: it holds other settings, or checkpoints.
         SettingsError: its settings cannot be read.
     """
     remedy = 'give the parameter folder another one, or remove it'
@@ -102,7 +101,7 @@ def own_run(member: Membership) -> tuple[RunSpec, Settings]:
     """The run that a learner announces, from its parameters.
 
     Raises:
-        NodeError: the method is no node's business, or the folder holds another run.
+        NodeError: nodes cannot run the method, or the folder holds another run.
         ParameterError: a setting is refused.
         TaskError: the task is unknown or cannot be used.
     """
@@ -119,15 +118,15 @@ def own_run(member: Membership) -> tuple[RunSpec, Settings]:
 def join(
     member: Membership, load_core: LoadCore, announce: Announce | None = None
 ) -> Joined | None:
-    """Become part of a run; None if asked to stop meanwhile.
+    """Join a run; None if asked to stop meanwhile.
 
     Args:
-        member: who joins.
-        load_core: what makes the core.
-        announce: decides what run it is, for the learner; all others wait for its announcement.
+        member: the node that joins.
+        load_core: imports and returns what makes the core.
+        announce: decides what run it is, in the learner; all others wait for its announcement.
 
     Raises:
-        NodeError: no run is announced, or not one for this node.
+        NodeError: no run is announced, or one that this node cannot join.
         ParameterError: a parameter is wrong, or contradicts the run.
         SettingsError: the run's settings cannot be read.
     """
@@ -172,7 +171,7 @@ def _known(member: Membership) -> RunSpec | None:
 
 
 def _taken(member: Membership, run: RunSpec) -> Settings:
-    """The settings of the run that somebody else announced."""
+    """The settings of a run that another node announced."""
     who, owner = member.link.full_name, _owner(member)
     settings = from_canonical(run.settings, f'run {run.run_id!r} of {owner}')
     refuse_in_process_only(who, settings)
@@ -182,7 +181,7 @@ def _taken(member: Membership, run: RunSpec) -> Settings:
 
 
 def _owner(member: Membership) -> str:
-    """The learner whose run it is, for errors: its topics are discovered before its name."""
+    """The learner of the run, for errors. ROS discovers its topics before its name."""
     node = member.link.node
     end = time.monotonic() + NAME_PATIENCE
     while not member.stop:

@@ -1,9 +1,9 @@
-"""A node's connection to ROS: one rclpy node, its executor, its topics. Callbacks only store; the
-main loop takes.
+"""A node's connection to ROS: one rclpy node, its executor, its topics. Callbacks only store
+messages; the main loop handles them.
 
-The executor is the events executor: its `spin_once` runs exactly one callback, so arriving
-messages are drained until the count of callbacks stands still; blocking in it costs nothing (0.3 %
-of a core at 50 ms) and a message wakes it.
+The events executor's `spin_once` runs exactly one callback. So messages are drained until the
+count of callbacks stands still. Blocking in it costs nothing (0.3 % of a core at 50 ms), and a
+message wakes it.
 """
 
 from collections import Counter, deque
@@ -24,7 +24,7 @@ RECORDS_OF_TOPIC = {topic: record_type for record_type, topic in TOPICS.items()}
 
 
 class Link:
-    """Publishes records and holds what arrived.
+    """Publishes records and holds the messages that arrived.
 
     Args:
         name: the node's name unless it is remapped.
@@ -51,7 +51,7 @@ class Link:
         return str(self.node.get_name())
 
     def store(self, handle: Callable[..., None], *arguments: Any) -> None:
-        """For callbacks: have the main loop do it at its next turn."""
+        """For callbacks: let the main loop call `handle` at its next turn."""
         self._events += 1
         self.inbox.append(lambda: handle(*arguments))
 
@@ -62,13 +62,13 @@ class Link:
         settings: Settings | None = None,
         raw: bool = False,
     ) -> None:
-        """Have `handle(record_type, message)` called by the main loop for each message on a
-        record's topic.
+        """Let the main loop call `handle(record_type, message)` for each message on the topic of a
+        kind of record.
 
         Args:
-            record_type: whose topic.
-            handle: gets the message, its bytes where `raw`.
-            settings: of the run, for the depth of the queue.
+            record_type: the kind of record.
+            handle: gets the message, or its bytes if `raw`.
+            settings: the settings of the run, for the depth of the queue.
             raw: hand over the serialised bytes as they came.
         """
         topic = TOPICS[record_type]
@@ -82,7 +82,7 @@ class Link:
         )
 
     def advertise(self, topics: Iterable[str], settings: Settings | None = None) -> None:
-        """Create publishers for these topics, unless they are there."""
+        """Create the publishers of these topics that do not exist yet."""
         for topic in topics:
             if topic not in self._publishers:
                 message_type = messages.message_type(RECORDS_OF_TOPIC[topic])
@@ -95,7 +95,7 @@ class Link:
         self.send(TOPICS[type(record)], self.message(record))
 
     def message(self, record: Record) -> Any:
-        """The message of a record, stamped with the time of now."""
+        """The message of a record, stamped with the present time."""
         return messages.to_message(record, self.node.get_clock().now().to_msg())
 
     def send(self, topic: str, message: Any) -> None:
@@ -104,7 +104,7 @@ class Link:
         self.published[topic] += 1
 
     def diagnose(self, level: bytes, message: str, counters: dict[str, dict[str, int]]) -> None:
-        """Publish on /diagnostics how messages fare."""
+        """Publish the counts of messages on /diagnostics."""
         values = [
             KeyValue(key=f'{kind} {topic}', value=str(n))
             for kind, by_topic in counters.items()
@@ -149,15 +149,15 @@ class Link:
     def unmatched(
         self, topics: Iterable[str], names: Callable[[str], set[str]], readers: bool
     ) -> list[str]:
-        """Which nodes, of those that should read (or write) our topics, the middleware has not
-        matched yet.
+        """Nodes that should read (or write) our topics and that the middleware has not matched
+        yet, in words.
 
         Args:
             topics: relative names.
-            names: fully qualified names of the nodes that must be there, by topic.
-            readers: whether they should read these topics (else: write).
+            names: returns the fully qualified names of the nodes that must be there, by topic.
+            readers: whether they should read these topics; else they should write them.
         """
-        found = []
+        unmatched = []
         for topic in topics:
             wanted = names(topic)
             full = self.node.resolve_topic_name(topic)
@@ -172,13 +172,13 @@ class Link:
                 else set()
             )
             verb = 'reads' if readers else 'publishes'
-            found += [
+            unmatched += [
                 f'{name} (not seen yet that it {verb} {full!r})' for name in sorted(wanted - there)
             ]
-        return found
+        return unmatched
 
     def unacknowledged(self) -> list[str]:
-        """Topics on which some reader has not confirmed yet that it has everything."""
+        """Topics on which a reader has not yet confirmed that it has everything."""
         return [
             topic
             for topic, publisher in self._publishers.items()

@@ -1,4 +1,4 @@
-"""A node's place among the others of a run: who it is, which run it is, and who else is there."""
+"""A node's place in a run: its identity, its run and the other nodes."""
 
 import hashlib
 import secrets
@@ -31,8 +31,8 @@ PRESENCE_EVERY = 1.0  # [s] between two messages of presence and diagnostics
 
 
 class Membership:
-    """What a node is to the others of its run: it publishes its presence, notes theirs, and takes
-    what they publish.
+    """A node among the others of its run: it publishes its presence, notes theirs, and takes the
+    records that they publish.
 
     Attributes:
         role: one of `records.ROLES`.
@@ -40,12 +40,13 @@ class Membership:
         link: the node's connection to ROS.
         log: the node's logger.
         peers: the other nodes.
-        traffic: what reaches the node's core, and how its messages fare.
+        traffic: hands records to the node's core and counts them.
         company: members in the same process, which take their turns with this one.
         values: the node's own parameters, once they are declared.
         run: the run, once it is known.
-        announcement: the message in which the run came; None where the node made it itself.
-        begun: whether all peers were there; from then on a nuisance ends no node.
+        announcement: the message that announced the run; None in the node that made it.
+        begun: whether all peers have been present; from then on, a conflict with another node or
+            run is logged and ends no node.
         doing: what the node does now, for people.
 
     Args:
@@ -68,26 +69,26 @@ class Membership:
         self.begun = False
         self.doing = 'starting'
         self._instance = secrets.token_hex(8)
-        self._serves = False  # the core is made: the run's settings are taken
+        self._serves = False  # the core is made from the run's settings
         self._fetcher: Fetcher | None = None
         self._logged: set[str] = set()  # errors that are logged once
         self._presence_at = 0.0
 
     @property
     def folder(self) -> Path | None:
-        """The folder of the run, where the node was given one."""
+        """The folder of the run; None if the node was given none."""
         return Path(self.values['folder']) if self.values.get('folder') else None
 
     @property
     def deadline(self) -> float:
-        """Seconds of patience with peers; 0: for ever."""
+        """Seconds to wait for peers; 0: for ever."""
         return float(self.values['peer_deadline'])
 
     def introduce(self) -> None:
-        """Declare the node's own parameters, and listen to presences and runs.
+        """Declare the node's own parameters, and subscribe to presences and runs.
 
         Raises:
-            ParameterError: one is unknown, of the wrong type or out of range.
+            ParameterError: one of them is unknown, of the wrong type or out of range.
         """
         parameters.check_names(self.link.node, self.role)
         self.values = parameters.declare_own(self.link.node, self.role)
@@ -96,14 +97,14 @@ class Membership:
         self.link.subscribe(RunSpec, self.take)
 
     def serve(self, core: Core[Any]) -> None:
-        """Hand records to a core from now on, and have what it lacks sent again."""
+        """Hand records to a core from now on, and fetch again those that it lacks."""
         self.traffic.core = core
         self._serves = True
         if self.run is not None and Commit in core.subscribes:
             self._fetcher = Fetcher(self.link, self.run.run_id, self.traffic.receive_again)
 
     def turn(self, wait: float = 0.0) -> None:
-        """Let ROS have its turn: take what arrived, publish presence when it is time.
+        """Give ROS its turn: take what arrived, and publish the presence when it is due.
 
         Args:
             wait: seconds to block for something to arrive, if nothing has.
@@ -119,7 +120,7 @@ class Membership:
     # ---- records
 
     def take(self, kind: type, message: Any) -> None:
-        """Take a message that arrived, whatever it is."""
+        """Take a message of any kind that arrived."""
         if kind not in (Presence, RunSpec):
             self.traffic.received[TOPICS[kind]] += 1  # sound or not, it is not lost
         try:
@@ -188,10 +189,10 @@ class Membership:
             self._log_once(problem)
             return
         now = time.monotonic()
-        news = self.peers.hear(presence, now)
+        news = self.peers.note(presence, now)
         if news:
             self.log.info(news)
-        self.traffic.ledger.tell(self.peers.told(), now)
+        self.traffic.ledger.note(self.peers.published(), now)
 
     def _log_once(self, text: str) -> None:
         if text not in self._logged:
@@ -199,10 +200,10 @@ class Membership:
             self.log.error(text)
 
     def publish_presence(self, finished: bool = False) -> None:
-        """Publish that the node is there, and on /diagnostics how its messages fare.
+        """Publish the node's presence, and the counts of its messages on /diagnostics.
 
         Args:
-            finished: whether it is the last time.
+            finished: whether this is the last presence.
         """
         self._presence_at = time.monotonic()
         topics = tuple(t for t in published_by(self.role) if t in self.link.published)
@@ -228,7 +229,7 @@ class Membership:
         )
 
     def close(self) -> None:
-        """Take the node, and whoever keeps it company, off the graph."""
+        """Take the node and its company off the graph."""
         for other in self.company:
             other.close()
         self.link.close()

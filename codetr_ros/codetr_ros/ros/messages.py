@@ -1,9 +1,10 @@
-"""Records to messages and back, generically: a message has the fields of its record, and a
+"""Converts any record to its message and back: a message has the fields of its record, and a
 `stamp`.
 
-The fields' types come from the generated message classes, so that a field added to both a record
-and its message needs nothing here. Arrays leave as `array.array` (numpy would be copied element by
-element: 100 ms instead of 0.04 ms for a policy) and arrive as numpy arrays in memory of our own.
+The fields' types come from the generated message classes. So a field added to both a record and
+its message needs no change here. Arrays leave as `array.array` (a numpy array would be copied
+element by element: 100 ms instead of 0.04 ms for a policy) and arrive as numpy arrays that own
+their memory.
 """
 
 import re
@@ -76,38 +77,38 @@ def _fields(record_type: type) -> tuple[_Field, ...]:
     if ['stamp', *names] != list(types):
         raise TypeError(
             f'{type_name(record_type)} has fields {list(types)}, its record {names}: build the '
-            f'workspace again'
+            'workspace again'
         )
-    found = []
+    travelling = []
     for name in names:
         kind = types[name]
         element = re.fullmatch(r'sequence<(\w+)>', kind)
         if kind == 'sequence<uint8>':
-            found.append(_Field(name, bytes, lambda value: value.tobytes()))
+            travelling.append(_Field(name, bytes, lambda value: value.tobytes()))
         elif element and element[1] in _SEQUENCES:
-            found.append(_Field(name, *_sequence(*_SEQUENCES[element[1]])))
+            travelling.append(_Field(name, *_sequence(*_SEQUENCES[element[1]])))
         elif element and element[1] == 'string':
-            found.append(_Field(name, list, tuple))
+            travelling.append(_Field(name, list, tuple))
         elif kind in _INTEGERS:
-            found.append(_Field(name, _integer(*_INTEGERS[kind]), int))
+            travelling.append(_Field(name, _integer(*_INTEGERS[kind]), int))
         elif kind in ('float', 'double'):
-            found.append(_Field(name, float, float))
+            travelling.append(_Field(name, float, float))
         elif kind in ('boolean', 'string'):
             plain = bool if kind == 'boolean' else str
-            found.append(_Field(name, plain, plain))
+            travelling.append(_Field(name, plain, plain))
         else:
             raise TypeError(
                 f'{type_name(record_type)}.{name}: no record has a field of type {kind}'
             )
-    return tuple(found)
+    return tuple(travelling)
 
 
 def to_message(record: Record, stamp: Time) -> Any:
     """The message of a record.
 
     Args:
-        record: what to say.
-        stamp: when it is said (ROS time); nothing is learnt from it.
+        record: the record.
+        stamp: when it is published (ROS time); nothing is learnt from it.
 
     Raises:
         RecordError: a number does not fit its field.
@@ -129,7 +130,7 @@ def from_message(message: Any) -> Record:
     """The record that a message carries; its arrays are copies.
 
     Raises:
-        RecordError: arrays whose lengths disagree; names field, length, expectation and source.
+        RecordError: lengths of arrays disagree; names field, length, expectation and source.
     """
     record_type = RECORD_TYPES[f'{PACKAGE}/msg/{type(message).__name__}']
     values = {

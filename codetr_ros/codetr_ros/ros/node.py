@@ -1,12 +1,12 @@
-"""The one main loop of all nodes: join the run, wait for everybody, then receive, work and publish
+"""The one main loop of all nodes: join the run, wait for all peers, then receive, work and publish
 in slices.
 
     drain what arrived -> core.receive -> one slice of core.work -> publish -> again
 
-Nothing is learnt in a callback and no thread spins beside the learner. A node answers (signals,
+Nothing is learnt in a callback, and no thread spins beside the learner. A node answers (signals,
 parameters, its presence) between two slices, so within the length of one: `sac.burst` updates in
 the learner, one gradient step or the labels of some hundred segments in the reward node, one chunk
-of each environment in a simulator, one episode in the evaluator. While it waits it answers within
+of each environment in a simulator, one episode in the evaluator. A waiting node answers within
 50 ms.
 """
 
@@ -35,10 +35,10 @@ from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import reports
 from codetr_ros.runs.reports import CoreReport
 
-ACK_DEADLINE = 5.0  # [s] at the end for readers that have not everything yet
-STOPPED_DEADLINE = 0.1  # [s] the same when the process was asked to stop
-SHUTDOWN_DEADLINE = 8  # [s] for the middleware to let go, once everything is saved and published:
-# well before `launcher.STOP_DEADLINE`, which counts from the signal on
+ACK_DEADLINE = 5.0  # [s] at the end for readers that still lack something
+STOPPED_DEADLINE = 0.1  # [s] the same if the process was asked to stop
+SHUTDOWN_DEADLINE = 8  # [s] for the middleware to shut down, after everything is saved and sent:
+# well before `launcher.STOP_DEADLINE`, which counts from the signal
 LAST_PRESENCES = 5  # enough for the middleware to request acknowledgements
 
 
@@ -58,13 +58,11 @@ class Node:
         self._join = join
         self._wire = wire
         self._log = member.log
-        self._sound = True  # the core is between two slices, fit to be saved
+        self._sound = True  # the core is between two slices and can be saved
         self._started = time.monotonic()
 
     def run(self) -> int:
-        """Everything, from the parameters to the last message; returns the exit code of the
-        process.
-        """
+        """Do everything from the parameters to the last message; returns the exit code."""
         error: str | None = None
         wiring: Wiring | None = None
         try:
@@ -81,12 +79,12 @@ class Node:
         return self._end(wiring, error)
 
     def _log_fatal(self, problem: Exception, when: str = '') -> None:
-        """Log an error: in its own words, or where it happened if it has none."""
+        """Log an error by its message, or by its traceback if it does not explain itself."""
         own = errors.explains_itself(problem)
         self._log.fatal(f'{when}{problem if own else traceback.format_exc()}')
 
     def _gather(self, wiring: Wiring) -> bool:
-        """Wait until everybody is there and matched. False if asked to stop meanwhile."""
+        """Wait until all peers are present and matched. False if asked to stop meanwhile."""
         if not (wiring.complete() and wait_for(self.member, wiring.lacking)):
             return False
         self.member.begun = True
@@ -183,9 +181,9 @@ class Node:
         """Publish the last presence, and stay until the readers have everything or have finished
         too.
 
-        A reader that lacks something is served again by this process only. The middleware asks
-        whether it does with every few messages, else only every 3 s: waiting for its answer alone
-        would make every run 3 s longer, and every stop.
+        Only this process can send a reader again what it lacks. The middleware requests
+        acknowledgements with every few messages, otherwise only every 3 s: waiting for that alone
+        would make every run and every stop 3 s longer.
         """
         member, link = self.member, self.member.link
         for other in member.company:
@@ -234,13 +232,13 @@ def run_node(
     Args:
         role: one of `records.ROLES`.
         name: node name unless remapped.
-        load_core: imports what is slow to import and returns what makes the core.
-        argv: command line without the program; that of the process where None.
-        stop: signals taken earlier; taken here where None.
+        load_core: does the slow imports and returns what makes the core.
+        argv: command line without the program; None: that of the process.
+        stop: handlers of signals that are installed already; None: install them here.
         wire: another wiring (the recorder's).
 
     Returns:
-        Exit code: 0 also when stopped by SIGINT or SIGTERM, 1 after an error.
+        Exit code: 0, also after SIGINT or SIGTERM; 1 after an error.
     """
     stop = stop or Stop().install()
     for variable, value in middleware.DEFAULTS.items():

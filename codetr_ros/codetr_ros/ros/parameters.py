@@ -1,9 +1,9 @@
 """Every setting of the run as a ROS parameter, with description and range, from the one
 configuration.
 
-The learner makes the run's settings from its parameters. All other nodes take them from the run,
-refuse a parameter that contradicts it, and then show the run's settings as read-only parameters,
-so that `ros2 param list|describe|get` answers alike at every node.
+The learner makes the run's settings from its parameters. All other nodes take them from the run
+and refuse a parameter that contradicts it. Then they show the run's settings as read-only
+parameters, so that `ros2 param list|describe|get` gives the same answer at every node.
 """
 
 import types
@@ -22,18 +22,18 @@ from codetr_ros.config import Settings, SettingsError, load
 
 Type = Parameter.Type
 NOT_GIVEN = 0.0
-"""What stands for 'not given' where a setting may be None: a ROS parameter always has a value."""
+"""Stands for None, 'not given', since a ROS parameter always has a value."""
 
 
 class ParameterError(ValueError):
-    """A parameter that is unknown, out of range or in contradiction to the run: names it, its
+    """A parameter that is unknown, out of range or contradicts the run: the message names it, its
     value and the remedy.
     """
 
 
 @dataclass(frozen=True)
 class Own:
-    """A parameter of the node itself, no setting of the run."""
+    """A parameter of the node itself, not a setting of the run."""
 
     default: str | float | bool
     description: str
@@ -57,14 +57,20 @@ class Own:
 
 
 OWN: dict[str, Own] = {
-    'run_id': Own('', 'id of the run; of the learner: the one it gives (empty: made from the '
-    'date), of all others: '
-                  'the only one they join (empty: any)'),
-    'folder': Own('', 'folder of the run, for checkpoints, bag and the report of the node; '
-    'empty: nothing is written'),
-    'peer_deadline': Own(60.0, 'seconds that the node waits for peers that are missing or '
-    'silent; 0: for ever'),
-}  # fmt: skip
+    'run_id': Own(
+        '',
+        'id of the run; in the learner: the id to give it (empty: made from the date), in all '
+        'other nodes: the only run to join (empty: any)',
+    ),
+    'folder': Own(
+        '',
+        'folder of the run, for checkpoints, bag and the report of the node; empty: nothing is '
+        'written',
+    ),
+    'peer_deadline': Own(
+        60.0, 'seconds that the node waits for peers that are missing or silent; 0: for ever'
+    ),
+}
 OWN_OF_ROLE: dict[str, dict[str, Own]] = {
     'learner': {
         'config': Own(
@@ -75,30 +81,29 @@ OWN_OF_ROLE: dict[str, dict[str, Own]] = {
         'checkpoint': Own(
             '',
             'reward model to start from: the folder of a checkpoint, of a fit or of a run; empty: '
-            'a new one. It must be of the same method, sizes and settings that shape it',
+            'a new one. Its method, its sizes and the settings that shape it must be the same',
             of_core=True,
         ),
         'frozen': Own(
             False,
-            'label as the checkpoint does, without learning; else the model goes on learning',
+            'true: label with the checkpoint as it is; false: let the model go on learning',
             of_core=True,
         ),
     },
     'record': {
         'bag': Own(
             '',
-            'folder of the bag; empty: `bag` in `folder`, or where that is empty too no bag at '
-            'all',
+            'folder of the bag; empty: `bag` in `folder`; without a `folder` too: no bag',
         ),
         'bag_split_mb': Own(
             1000.0,
-            'megabytes after which the bag goes on in its next file; 0: never',
+            'megabytes after which the bag continues in a new file; 0: never',
             high=1e6,
         ),
         'bag_keep_free_mb': Own(
             64.0,
-            'megabytes of the disk to leave free: with fewer left, the bag is closed and the run '
-            'ends, while there is room for its index; 0: go on until the disk is full',
+            'megabytes to leave free on the disk: when fewer are left, the bag is closed while '
+            'there is room for its index, and the run ends; 0: go on until the disk is full',
             high=1e6,
         ),
     },
@@ -106,23 +111,23 @@ OWN_OF_ROLE: dict[str, dict[str, Own]] = {
 
 
 def own_parameters(role: str) -> dict[str, Own]:
-    """The parameters that a node of this role has besides the settings."""
+    """The parameters of a node of this role besides the settings."""
     return OWN | OWN_OF_ROLE.get(role, {})
 
 
 def core_parameters(role: str) -> tuple[str, ...]:
-    """Those of them that the core of this role is made with."""
+    """The names of those parameters that are passed to the core of this role."""
     return tuple(name for name, own in own_parameters(role).items() if own.of_core)
 
 
 def _settings_fields(model: type[BaseModel], prefix: str = '') -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    fields: dict[str, Any] = {}
     for name, field in model.model_fields.items():
         if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
-            found |= _settings_fields(field.annotation, f'{prefix}{name}.')
+            fields |= _settings_fields(field.annotation, f'{prefix}{name}.')
         else:
-            found[prefix + name] = field
-    return found
+            fields[prefix + name] = field
+    return fields
 
 
 FIELDS = _settings_fields(Settings)
@@ -132,21 +137,21 @@ FIELDS = _settings_fields(Settings)
 def _bounds(field: Any) -> tuple[float | None, float | None, list[str]]:
     low: Any = None
     high: Any = None
-    said = []
+    constraints = []
     for rule in field.metadata:
         if isinstance(rule, (Ge, Gt)):
             low = rule.ge if isinstance(rule, Ge) else rule.gt
             if isinstance(rule, Gt):
-                said.append(f'greater than {low:g}')
+                constraints.append(f'greater than {low:g}')
         elif isinstance(rule, (Le, Lt)):
             high = rule.le if isinstance(rule, Le) else rule.lt
             if isinstance(rule, Lt):
-                said.append(f'less than {high:g}')
+                constraints.append(f'less than {high:g}')
         elif isinstance(rule, (MinLen, MaxLen)):
             least = isinstance(rule, MinLen)
             n = rule.min_length if least else rule.max_length  # type: ignore[union-attr]
-            said.append(f'length at {"least" if least else "most"} {n}')
-    return low, high, said
+            constraints.append(f'length at {"least" if least else "most"} {n}')
+    return low, high, constraints
 
 
 def _plain(annotation: Any) -> tuple[Any, bool]:
@@ -161,11 +166,11 @@ def descriptor(name: str) -> ParameterDescriptor:
     """Type, description and range of a setting, from its pydantic field."""
     field = FIELDS[name]
     kind, optional = _plain(field.annotation)
-    low, high, said = _bounds(field)
+    low, high, constraints = _bounds(field)
     shown = ParameterDescriptor(description=field.description or '', read_only=True)
     if typing.get_origin(kind) is Literal:
         shown.type = Type.STRING.value
-        said.append('one of: ' + ', '.join(typing.get_args(kind)))
+        constraints.append('one of: ' + ', '.join(typing.get_args(kind)))
     elif typing.get_origin(kind) is tuple:
         shown.type = Type.INTEGER_ARRAY.value
     elif kind is bool:
@@ -183,8 +188,8 @@ def descriptor(name: str) -> ParameterDescriptor:
     else:
         shown.type = Type.STRING.value
     if optional:
-        said.append(f'{NOT_GIVEN:g}: not given')
-    shown.additional_constraints = '; '.join(said)
+        constraints.append(f'{NOT_GIVEN:g}: not given')
+    shown.additional_constraints = '; '.join(constraints)
     return shown
 
 
@@ -202,7 +207,7 @@ def _inward(name: str, value: Any) -> Any:
 
 
 def overrides(node: Node) -> dict[str, Any]:
-    """What the user gave on the command line or in a parameter file, for any parameter."""
+    """The parameters that the user gave on the command line or in a parameter file."""
     # rclpy offers no public way to see overrides before they are declared
     given = node._parameter_overrides  # noqa: SLF001
     return {name: parameter.value for name, parameter in given.items()}
@@ -212,7 +217,7 @@ def check_names(node: Node, role: str) -> None:
     """Refuse parameters that do not exist.
 
     Raises:
-        ParameterError: names all of them, and what there is.
+        ParameterError: names all of them, and those that exist.
     """
     known = set(FIELDS) | set(own_parameters(role))
     unknown = {
@@ -255,8 +260,7 @@ def declare_own(node: Node, role: str) -> dict[str, Any]:
         ):
             raise ParameterError(
                 f'{node.get_fully_qualified_name()}: parameter {name} = {value!r} must be a '
-                f'number from '
-                f'{own.low:g} to {own.high:g} ({own.description})'
+                f'number from {own.low:g} to {own.high:g} ({own.description})'
             )
         else:
             value = float(value)
@@ -278,8 +282,8 @@ def declare_settings(node: Node, settings: Settings) -> None:
 
 
 def own_settings(node: Node, config: str) -> Settings:
-    """The settings that a learner's parameters ask for: its `config`, changed by what was given
-    one by one.
+    """The settings that a learner's parameters ask for: its `config`, changed by those given one
+    by one.
 
     Raises:
         ParameterError: a setting is refused; names it, its value and what is allowed.
@@ -297,9 +301,9 @@ def check_against_run(node: Node, settings: Settings, owner: str) -> None:
     """Refuse a parameter that contradicts the run's settings.
 
     Args:
-        node: who was given parameters.
-        settings: of the run.
-        owner: name of the learner whose run it is.
+        node: the node with the parameters.
+        settings: the settings of the run.
+        owner: name of the learner that announced the run.
 
     Raises:
         ParameterError: names every such parameter, both values and both nodes.
@@ -323,6 +327,5 @@ def check_against_run(node: Node, settings: Settings, owner: str) -> None:
     if wrong:
         raise ParameterError(
             f'{name_of_node}: parameters contradict the run: {"; ".join(wrong)}. Leave them out '
-            f'(the node takes '
-            f'them from the run) or start {owner} with them'
+            f'(the node takes them from the run) or start {owner} with them'
         )

@@ -1,4 +1,4 @@
-"""When waiting is pointless: what a node waits for is lost, or who would send it is gone."""
+"""When waiting is pointless: the awaited records are lost, or their publisher is gone."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -7,19 +7,19 @@ from codetr_ros.records.roles import TABLE
 from codetr_ros.ros.errors import NodeError
 from codetr_ros.ros.peers import Peers
 
-NAME_EVERY = 5.0  # [s] between two complaints about the same peers
-GRACE = 10.0  # [s] for what a peer published before it finished
+NAME_EVERY = 5.0  # [s] between two warnings about the same peers
+GRACE = 10.0  # [s] for records that a peer published before it finished
 
 
 class Patience:
-    """Watches over a node that waits amid the run.
+    """Watches over a node that waits during the run.
 
     Args:
         who: fully qualified name of the node.
         role: its role.
-        topics: what it waits for comes on one of these.
+        topics: those on which the awaited records arrive.
         peers: the other nodes.
-        deadline: seconds of patience; 0: for ever.
+        deadline: seconds to wait; 0: for ever.
         log: the node's logger.
     """
 
@@ -41,17 +41,17 @@ class Patience:
         self._named: dict[str, float] = {}
 
     def check(self, now: float, waiting: float, doing: str, lost: Mapping[str, int]) -> None:
-        """Name peers that fell silent, and give up on what will not come.
+        """Log which peers are silent, and give up on records that will not arrive.
 
         Args:
             now: monotonic time [s].
             waiting: seconds for which the node has waited.
             doing: what it waits for, in words.
-            lost: records by topic that were published and have not come, not even when they were
-                asked for again.
+            lost: counts of records by topic that were published and never arrived, not even when
+                fetched again.
 
         Raises:
-            NodeError: a peer that we wait for is gone, or what we wait for is lost.
+            NodeError: an awaited peer is gone, or awaited records are lost.
         """
         self._check_silent(now, waiting, doing)
         self._check_finished(now, waiting, doing)
@@ -61,15 +61,15 @@ class Patience:
                 f'{self._who} gave up after {waiting:.0f} s: it {doing}, and messages that were '
                 f'published never reached it: {lacking} (parameter peer_deadline = '
                 f'{self._deadline:g}). Look for an overloaded machine or network, and start the '
-                f'run again'
+                'run again'
             )
 
     def _check_silent(self, now: float, waiting: float, doing: str) -> None:
         for peer in self._peers.awaited(self._topics):
-            silent = now - peer.heard
-            if peer.said.finished or silent < 2 * NAME_EVERY:
+            silent = now - peer.received_at
+            if peer.presence.finished or silent < 2 * NAME_EVERY:
                 continue
-            who = f'{peer.said.role} {peer.said.node}'
+            who = f'{peer.presence.role} {peer.presence.node}'
             if self._deadline and silent > self._deadline and waiting > self._deadline:
                 raise NodeError(
                     f'{self._who} gave up: it {doing}, and {who} has been silent for '
@@ -82,11 +82,12 @@ class Patience:
 
     def _check_finished(self, now: float, waiting: float, doing: str) -> None:
         for role in TABLE[self._role].relies_on:
-            gone = [peer for peer in self._peers.alive(role) if peer.said.finished]
+            gone = [peer for peer in self._peers.alive(role) if peer.presence.finished]
             all_gone = gone and len(gone) == len(self._peers.alive(role))
             patience = GRACE if all_gone else max(GRACE, self._deadline)
-            if gone and waiting > patience and all(now - peer.heard > GRACE for peer in gone):
-                names = ', '.join(peer.said.node for peer in gone)
+            settled = all(now - peer.received_at > GRACE for peer in gone)
+            if gone and waiting > patience and settled:
+                names = ', '.join(peer.presence.node for peer in gone)
                 raise NodeError(
                     f'{self._who} gave up: it {doing}, but {role} {names} stopped before the run '
                     f'was over. Look at its log, and start the run again'

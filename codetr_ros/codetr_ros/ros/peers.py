@@ -1,10 +1,8 @@
-"""Who takes part in a run: which roles it needs, who has said `Presence`, who is missing or
-silent.
+"""The nodes of a run: which roles it needs, which nodes are present, which are missing or silent.
 
-A node begins only when every peer that its topics need is there and matched, by name: a count of
-subscriptions cannot tell a recorder from `ros2 topic echo`. From then on nothing is lost
-(reliable, deep enough queues), and what peers say they have published tells a node what never
-reached it.
+A node begins only when every peer that its topics need is present and matched by name: a count of
+subscriptions cannot distinguish a recorder from `ros2 topic echo`. From then on nothing is lost
+(reliable, deep enough queues). The counts that peers publish show a node what never reached it.
 """
 
 from collections import Counter, deque
@@ -17,66 +15,63 @@ from codetr_ros.records import Presence, roles
 
 @dataclass
 class Peer:
-    """Another node, as its last `Presence` has it."""
+    """Another node, as its last `Presence` describes it."""
 
-    said: Presence
-    heard: float  # monotonic time [s] of its last word
+    presence: Presence
+    received_at: float  # monotonic time [s] when the presence arrived
 
     @property
     def published(self) -> dict[str, int]:
-        """Records that it says it has published, by topic."""
-        return dict(zip(self.said.topics, self.said.published.tolist(), strict=True))
+        """Counts of the records that it has published, by topic."""
+        presence = self.presence
+        return dict(zip(presence.topics, presence.published.tolist(), strict=True))
 
 
 @dataclass
 class Peers:
-    """The other nodes of the run, by instance (a process that was started again is another
-    one).
-    """
+    """The other nodes of the run, by instance: a restarted process is another one."""
 
     role: str
     by_instance: dict[str, Peer] = field(default_factory=dict)
 
-    def hear(self, said: Presence, now: float) -> str | None:
+    def note(self, presence: Presence, now: float) -> str | None:
         """Note a peer's presence; returns what is new about it, for the log."""
-        known = self.by_instance.get(said.instance_id)
-        self.by_instance[said.instance_id] = Peer(said, now)
+        known = self.by_instance.get(presence.instance_id)
+        self.by_instance[presence.instance_id] = Peer(presence, now)
+        who = f'{presence.role} {presence.node}'
         if known is None:
-            before = [p for p in self.by_instance.values() if p.said.node == said.node]
-            again = ' again' if len(before) > 1 else ''
-            return f'{said.role} {said.node} is there{again}'
-        if said.finished and not known.said.finished:
-            return f'{said.role} {said.node} has finished'
+            before = [p for p in self.by_instance.values() if p.presence.node == presence.node]
+            return f'{who} is there{" again" if len(before) > 1 else ""}'
+        if presence.finished and not known.presence.finished:
+            return f'{who} has finished'
         return None
 
     def newest(self) -> list[Peer]:
-        """The newest instance of each node: one that was killed says no last word, and does not
-        count once another has taken its place.
+        """The newest instance of each node. A killed instance publishes no last presence, and
+        does not count once another has taken its place.
         """
-        found: dict[str, Peer] = {}
+        newest: dict[str, Peer] = {}
         for peer in self.by_instance.values():
-            old = found.get(peer.said.node)
-            if old is None or peer.heard >= old.heard:
-                found[peer.said.node] = peer
-        return list(found.values())
+            old = newest.get(peer.presence.node)
+            if old is None or peer.received_at >= old.received_at:
+                newest[peer.presence.node] = peer
+        return list(newest.values())
 
     def alive(self, role: str) -> list[Peer]:
         """Peers of a role, the newest instance of each node."""
-        return [peer for peer in self.newest() if peer.said.role == role]
+        return [peer for peer in self.newest() if peer.presence.role == role]
 
     def absent(self, settings: Settings, settings_hash: str) -> list[str]:
-        """Roles of which too few nodes with the run's settings are there, with what would start
-        them.
-        """
+        """Roles that lack nodes with the run's settings, and the commands that start them."""
         missing = []
         for role, count in settings.roles.items():
-            there = [p for p in self.alive(role) if not p.said.finished]
-            ready = [p for p in there if p.said.settings_hash == settings_hash]
+            there = [p for p in self.alive(role) if not p.presence.finished]
+            ready = [p for p in there if p.presence.settings_hash == settings_hash]
             have = len(ready) + (role == self.role)
             if have >= count:
                 continue
             of = f' {have + 1} of {count}' if count > 1 else ''
-            if starting := [p.said.node for p in there if p not in ready]:
+            if starting := [p.presence.node for p in there if p not in ready]:
                 missing.append(f'{role}{of} ({", ".join(starting)} is there, but not ready yet)')
             else:
                 start = roles.command(role)
@@ -89,11 +84,11 @@ class Peers:
         return [peer for role in sorted(writers) for peer in self.alive(role)]
 
     def anybody_left(self) -> bool:
-        """Whether some peer has not finished."""
-        return any(not peer.said.finished for peer in self.newest())
+        """Whether any peer has not finished."""
+        return any(not peer.presence.finished for peer in self.newest())
 
-    def told(self) -> 'Counter[str]':
-        """Records that all peers say they have published, by topic."""
+    def published(self) -> 'Counter[str]':
+        """Counts of the records that all peers have published, by topic."""
         total: Counter[str] = Counter()
         for peer in self.by_instance.values():
             total.update(peer.published)
@@ -101,26 +96,26 @@ class Peers:
 
 
 class Ledger:
-    """Says what was published but never arrived.
+    """Counts records that were published but never arrived.
 
-    A `Presence` may overtake the messages it counts, so a record counts as lost only when it has
-    not come `patience` seconds after its publisher said that it was published.
+    A `Presence` may overtake the messages that it counts. So a record counts as lost only when it
+    has not arrived `patience` seconds after a presence that counts it.
     """
 
     def __init__(self, patience: float = 5.0) -> None:
         self._patience = patience
-        self._told: deque[tuple[float, Counter[str]]] = deque()
+        self._published: deque[tuple[float, Counter[str]]] = deque()  # times, counts by then
         self._due: Counter[str] = Counter()
 
-    def tell(self, told: 'Counter[str]', now: float) -> None:
-        """Note what peers say they have published by now."""
-        if not self._told or self._told[-1][1] != told:
-            self._told.append((now, told))
+    def note(self, published: 'Counter[str]', now: float) -> None:
+        """Note the counts of the records that peers have published by now, by topic."""
+        if not self._published or self._published[-1][1] != published:
+            self._published.append((now, published))
 
     def lost(self, received: 'Counter[str]', now: float) -> dict[str, int]:
-        """Records missing by topic; only topics of which some are."""
-        while self._told and self._told[0][0] <= now - self._patience:
-            self._due = self._told.popleft()[1]
+        """Counts of the lost records, for topics that lost any."""
+        while self._published and self._published[0][0] <= now - self._patience:
+            self._due = self._published.popleft()[1]
         return {
             topic: n - received[topic]
             for topic, n in sorted(self._due.items())

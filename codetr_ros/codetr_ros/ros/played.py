@@ -1,4 +1,4 @@
-"""Roles of a recorded run that are there because live nodes wait for them."""
+"""The played roles of a recorded run: live nodes wait for them."""
 
 from collections.abc import Collection
 from typing import Any
@@ -18,7 +18,7 @@ from codetr_ros.ros.wiring import Wiring
 
 
 def _must_read(role: str, settings: Settings, live: Collection[str]) -> list[type]:
-    """Kinds of records that live nodes insist on this role reading."""
+    """Kinds of records for which live nodes wait until this role reads them."""
     return [
         RECORDS_OF_TOPIC[topic]
         for topic, roles in readers(settings.labels_steps).items()
@@ -27,12 +27,12 @@ def _must_read(role: str, settings: Settings, live: Collection[str]) -> list[typ
 
 
 class PlayedWiring(Wiring):
-    """The wiring of a role that is played: its peers matter only where they are live.
+    """The wiring of a played role: only its live peers matter.
 
     Args:
         member: the played node's membership.
-        joined: what it has joined.
-        live: roles whose nodes are there themselves.
+        joined: the run that it has joined.
+        live: roles whose real nodes take part.
     """
 
     def __init__(self, member: Membership, joined: Joined, live: Collection[str]) -> None:
@@ -40,9 +40,7 @@ class PlayedWiring(Wiring):
         self._live = live
 
     def open(self) -> None:
-        """Subscribe to what the core wants; read the rest that live nodes want to be read without
-        looking at it.
-        """
+        """Subscribe to what the core wants. What else live nodes need read is read and ignored."""
         super().open()
         settings = self.joined.settings
         for kind in _must_read(self.member.role, settings, self._live):
@@ -53,18 +51,18 @@ class PlayedWiring(Wiring):
         self.member.traffic.received[TOPICS[kind]] += 1
 
     def lacking(self) -> list[str]:
-        """Who is not there yet, or not matched."""
+        """The live peers that are absent or not matched yet, in words."""
         run, settings = self.joined.run, self.joined.settings
         return absent_or_unmatched(self.member, settings, run.settings_hash, self._live)
 
 
 class Cast:
-    """All roles that are played beside the recorder. What they publish, the player sends.
+    """All roles that are played beside the recorder. The player sends what they publish.
 
     Args:
-        recorder: the played recorder, whose company they are.
+        recorder: the played recorder; the others keep it company.
         recorded: the run.
-        live: roles whose nodes are there themselves, and that nobody plays.
+        live: roles whose real nodes take part, and which are not played.
     """
 
     def __init__(self, recorder: Membership, recorded: RecordedRun, live: Collection[str]) -> None:
@@ -75,7 +73,7 @@ class Cast:
         self._links: dict[tuple[str, str], Link] = {('record', ''): recorder.link}
 
     def play(self, role: str, name: str) -> bool:
-        """Have a node of this role and name join the run, unless the role is live; false if asked
+        """Let a node of this role and name join the run, unless the role is live; false if asked
         to stop meanwhile.
         """
         if role in self._live:
@@ -95,16 +93,16 @@ class Cast:
         return True
 
     def link(self, role: str, name: str) -> Link | None:
-        """What publishes for a played node; None if it is live.
+        """The connection that publishes for a played node; None if the node is live.
 
         Args:
             role: its role.
-            name: its name where it is a simulator, else empty.
+            name: its name if it is a simulator, else empty.
         """
         return self._links.get((role, name))
 
     def lacking(self) -> list[str]:
-        """Who is not there yet, or not matched with somebody who is played."""
+        """The nodes that are absent or not matched with a played node yet, in words."""
         return [text for wiring in self._wirings for text in wiring.lacking()]
 
 

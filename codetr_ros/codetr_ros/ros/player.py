@@ -1,11 +1,11 @@
 """Plays a recorded run to nodes that learn from it, as if it were live.
 
 Every role of the run that is not live is played, under its own node name, since nodes wait for
-their peers by role and name: the recorder (whose main loop this is, and who sends a phase again to
-whoever lacks it), the simulators, and the learner, reward node and evaluator unless they are there
-themselves. What the recorded nodes of live roles said is not played. The messages go out as the
-bytes that were recorded; only where a live learner announces a run of its own are they written
-anew, under its id.
+their peers by role and name. The recorder is always played: this is its main loop, and it sends a
+phase again to a node that lacks it. So are the simulators, and the learner, reward node and
+evaluator where they are not live. Messages of the recorded nodes of live roles are not played. The
+messages go out as the bytes that were recorded. Only if a live learner announces a run of its own
+are they written anew, under its id.
 """
 
 import sys
@@ -34,18 +34,18 @@ from codetr_ros.ros.resend import Resender
 from codetr_ros.ros.signals import Stop
 
 LEARNERS = ('reward', 'learner')
-"""Roles that learn from what is played, and that it waits for."""
-LOG_EVERY = 5.0  # [s] between two lines on how far it is
+"""Roles that learn from what is played; playing waits for them."""
+LOG_EVERY = 5.0  # [s] between two log lines about progress
 MUST_AGREE = ('task', 'composite', 'beta', 'delay', 'phase_steps', 'simulators', 'envs')
-"""Settings under which the steps were made: a live learner must have the same."""
+"""Settings that made the steps: a live learner must have the same."""
 
 
 def check_settings(recorded: RecordedRun, settings: Settings) -> None:
-    """Refuse a live learner whose run the recorded steps cannot be part of.
+    """Refuse a live learner if the recorded steps do not fit its run.
 
     Args:
         recorded: the recorded run.
-        settings: of the learner's run.
+        settings: the settings of the learner's run.
 
     Raises:
         NodeError: names the setting and both values.
@@ -68,14 +68,14 @@ def check_settings(recorded: RecordedRun, settings: Settings) -> None:
 
 
 class Playing(PlayedWiring):
-    """The wiring of the played recorder, and with it of everybody else who is played.
+    """The wiring of the played recorder, and through it of all other played nodes.
 
     Args:
         member: the played recorder's membership.
-        joined: what it has joined.
+        joined: the run that it has joined.
         recorded: the run that is played.
-        live: roles whose nodes are there themselves.
-        cast: everybody else who is played.
+        live: roles whose real nodes take part.
+        others: all other played nodes.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Playing(PlayedWiring):
         self.left = 0  # messages of roles that are live
 
     def open(self) -> None:
-        """Receive who has handled what, and offer to send a phase again."""
+        """Subscribe to what nodes report, and offer to send a phase again."""
         super().open()
         settings = self.joined.settings
         self._last = Resender(self.member.link, self.joined.run.run_id, settings.lag + 2)
@@ -104,10 +104,10 @@ class Playing(PlayedWiring):
     # ---- joining
 
     def complete(self) -> bool:
-        """Have everybody who is played join, if it is a run that can be played to.
+        """Let all played nodes join, if the recorded run can be played to the live nodes.
 
         Raises:
-            NodeError: the live nodes' run is another one, or has no such nodes.
+            NodeError: the run of the live nodes differs from it, or has no such nodes.
         """
         settings = self.joined.settings
         check_settings(self._recorded, settings)
@@ -133,13 +133,13 @@ class Playing(PlayedWiring):
             )
 
     def lacking(self) -> list[str]:
-        """Who is not there yet, or not matched with somebody who is played."""
+        """The nodes that are absent or not matched with a played node yet, in words."""
         return super().lacking() or self._cast.lacking()
 
     # ---- playing
 
     def deliver(self, given: Item) -> None:
-        """Publish a message as the node that published it in the run, unless that is live."""
+        """Publish a message as the node that published it in the run, unless that node is live."""
         record: Any = given.record
         link = self._cast.link(*self._publisher(record))
         if link is None:
@@ -158,7 +158,7 @@ class Playing(PlayedWiring):
         self.played[topic] += 1
 
     def _publisher(self, record: Any) -> tuple[str, str]:
-        """Role of the node that published a record, and its name where it is a simulator."""
+        """Role of the node that published a record, and its name if it is a simulator."""
         if isinstance(record, Metrics):
             return record.role, record.node if record.role == 'sim' else ''
         if isinstance(record, EpisodeResult) and record.purpose != 'training':
@@ -166,7 +166,7 @@ class Playing(PlayedWiring):
         (role, *_) = WRITERS[TOPICS[type(record)]]
         if role != 'sim':
             return role, ''
-        # a person's score, too, goes out with the simulator whose segment it is
+        # a person's score, too, goes out through the simulator of its segment
         return 'sim', self._simulator_of(record.source)
 
     def _simulator_of(self, source: str) -> str:
@@ -182,40 +182,41 @@ class Playing(PlayedWiring):
         return [peer for role in self._live for peer in self.member.peers.alive(role)]
 
     def waits(self) -> str:
-        """What is waited for.
+        """What the player waits for, in words.
 
         Raises:
             NodeError: a live node has stopped.
         """
         doing = super().waits()
         for peer in self._audience():
-            if peer.said.finished and not self._playback.done(peer.said.role):
+            presence = peer.presence
+            if presence.finished and not self._playback.done(presence.role):
                 raise NodeError(
-                    f'{peer.said.role} {peer.said.node} stopped before everything was played: it '
+                    f'{presence.role} {presence.node} stopped before everything was played: it '
                     f'{doing}. Look at its log, and play again'
                 )
         return doing
 
     def settled(self, seconds: float) -> bool:
-        """Whether everybody who was played to has finished.
+        """Whether all live nodes have finished.
 
         Raises:
-            NodeError: somebody has not, and is silent.
+            NodeError: one of them has not, and is silent.
         """
         if not self._done:
             self._done = True
             learnt = ' and learnt from' if self._live else ''
             self.log.info(f'everything is played{learnt}')
-        left = [peer for peer in self._audience() if not peer.said.finished]
+        left = [peer for peer in self._audience() if not peer.presence.finished]
         deadline = self.member.deadline
         for peer in left:
-            silent = time.monotonic() - peer.heard
+            silent = time.monotonic() - peer.received_at
             if deadline and silent > deadline:
                 raise NodeError(
-                    f'everything is played, but {peer.said.role} {peer.said.node} has been silent '
-                    f'for {silent:.0f} s (--deadline {deadline:g}): look at its log'
+                    f'everything is played, but {peer.presence.role} {peer.presence.node} has '
+                    f'been silent for {silent:.0f} s (--deadline {deadline:g}): look at its log'
                 )
-        names = ', '.join(peer.said.node for peer in left)
+        names = ', '.join(peer.presence.node for peer in left)
         self.member.doing = f'waits for the end of {names}'
         return not left
 
@@ -231,16 +232,16 @@ class Playing(PlayedWiring):
             print(
                 f'{self.left} messages of {" and ".join(self._live)} were left to the live nodes'
             )
-        sys.stdout.flush()  # nobody else does if the middleware hangs now
+        sys.stdout.flush()  # if the middleware hangs now, nothing else flushes it
 
 
 class Player:
-    """The node that plays a run: the recorder's, with everybody else who is played.
+    """The node that plays a run: the played recorder, with all other played nodes.
 
     Args:
         recorded: the run.
         items: makes an iterator over its messages.
-        live: roles whose nodes are there themselves.
+        live: roles whose real nodes take part.
         pace: when messages are due at the earliest; None: at once.
         stop: true once the process is asked to stop.
     """
@@ -296,13 +297,14 @@ def play(
     Args:
         recorded: the run.
         items: makes an iterator over its messages.
-        live: roles whose nodes are there themselves.
+        live: roles whose real nodes take part.
         pace: when messages are due at the earliest; None: at once.
         namespace: where to publish, such as '/play'.
         deadline: seconds to wait for nodes that are missing or silent; 0: for ever.
 
     Returns:
-        Exit code: 0 when all is played and learnt from, or when asked to stop; 1 after an error.
+        Exit code: 0 after everything is played and learnt from, or if asked to stop; 1 after an
+        error.
     """
     stop = Stop().install()
     arguments = ['-r', f'__ns:={namespace}', '-p', f'peer_deadline:={deadline}']

@@ -1,25 +1,27 @@
 """Quality of service, named once per topic.
 
-Reliable everywhere. What a late joiner must still hear (`run`, `task`, `policy`, `commits`) is
-transient local. Every queue is deeper than what the permitted phases can put on its topic:
-KEEP_LAST would drop the rest silently, and KEEP_ALL blocks the publisher. `max(FLOOR, MARGIN *
-most)` is the depth, where `most` is, for P = lag + 1 phases (one more than is ever permitted and
-not yet committed) of N = phase_steps steps, all sources together:
+Every topic is reliable. Topics that a late node must still receive (`run`, `task`, `policy`,
+`commits`) are transient local. Every queue is deeper than the number of messages that the
+permitted phases can put on its topic: KEEP_LAST would drop the rest silently, and KEEP_ALL blocks
+the publisher. The depth is `max(FLOOR, MARGIN * most)`. The table gives `most` for P = lag + 1
+phases (one more than are ever permitted and not yet committed) of N = phase_steps steps, all
+sources together:
 
-    transitions, true_rewards   P * N                      a chunk has at least one step
-    composite_rewards           P * N                      a segment has at least one step
-    episodes                    P * N + evaluate_episodes  an episode has at least one step
+    transitions, true_rewards   P * N                       a chunk has at least one step
+    composite_rewards           P * N                       a segment has at least one step
+    episodes                    P * N + evaluate_episodes   an episode has at least one step
     step_rewards                P * (sources + ceil(16 * memory_steps / 100 kB))
-                                                           at most 4 bytes for each label and 12
-                                                           for its segment, in parts of more than
-                                                           half of 200 kB
-    metrics                     P * (4 + simulators) * 4   a few from each node and phase
-    policy                      P + ceil(4000 / N)         and those that come while an evaluation
-    episode runs
-    commits, task               P; sources
+                                                            at most 4 bytes for each label and 12
+                                                            for its segment, in parts of more than
+                                                            half of 200 kB
+    metrics                     P * (4 + simulators) * 4    a few from each node and phase
+    policy                      P + ceil(4000 / N)          those that come during an evaluation
+                                                            episode are added
+    commits                     P                           one for each phase
+    task                        sources                     one for each source
 
-A depth costs nothing by itself: the middleware keeps what has been published, not room for what
-might be.
+A depth costs nothing by itself: the middleware stores messages that were published and reserves
+no room for others.
 """
 
 from collections.abc import Callable
@@ -34,7 +36,7 @@ from codetr_ros.records import MESSAGE_BYTES
 FLOOR = 16
 MARGIN = 1.25
 HALF_A_PART = MESSAGE_BYTES // 2
-"""Bytes of a part of step rewards that are filled in any case."""
+"""Bytes of a part of step rewards that are always filled."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +78,8 @@ def depth(topic: str, settings: Settings | None = None) -> int:
 
     Args:
         topic: relative name, one of `records.TOPICS`.
-        settings: of the run; not needed for `run` and `presence`, which come before the settings
-            are known.
+        settings: the settings of the run; not needed for `run` and `presence`, which are opened
+            before the settings are known.
     """
     return max(FLOOR, ceil(MARGIN * QUALITIES[topic].most(settings or Settings())))
 

@@ -1,11 +1,10 @@
-"""The recorder's wiring: writes what arrives as it came, and commits phases.
+"""The recorder's wiring: writes messages as they arrive, and commits phases.
 
-Everything of the run is appended to the bag as received bytes before the core sees it, sound or
-not. A commit goes into the bag after all that it names, and out to the nodes only when the bag is
-flushed and synced: nobody learns from what could be lost, and the bag says of every phase that
-anybody has learnt from what belongs to it. What belongs to another run is refused and not
-recorded. The last phases are kept in memory too, and the service `fetch_phase` sends one of them
-again.
+Every message of the run is appended to the bag as received bytes before the core sees it, sound or
+not. A commit goes into the bag after all records that it names, and out to the nodes only after
+the bag is flushed and synced. So nobody learns from what could be lost, and the bag names the
+records of every phase that anybody has learnt from. Messages of another run are refused and not
+recorded. The last phases stay in memory too: the service `fetch_phase` sends one of them again.
 """
 
 import time
@@ -31,9 +30,9 @@ from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.reports import BagReport, FlushTimes
 
 NOT_RECORDED = (Presence,)
-"""Says who is alive, once a second: nothing of the run itself."""
+"""Published once a second to show that a node is alive: no part of the run itself."""
 FLUSHES = 1000
-"""Flushes of which the report gives the median: the newest."""
+"""Number of the newest flushes, whose median the report gives."""
 
 
 class Recording(Wiring):
@@ -64,7 +63,7 @@ class Recording(Wiring):
             self.log.info(f'records to {folder}')
         self._write(RunSpec, serialize_message(self.member.announcement))
         for kind in self._full:
-            if kind not in (RunSpec, Commit):  # the one has come, the other is our own
+            if kind not in (RunSpec, Commit):  # the first has arrived, the second is our own
                 link.subscribe(kind, self.take, settings, raw=True)
         self._last = Resender(link, self.joined.run.run_id, settings.lag + 2)
 
@@ -83,7 +82,7 @@ class Recording(Wiring):
         """Write the bytes of a message as they came, and hand the record to the core."""
         self.member.traffic.received[TOPICS[kind]] += 1
         if self._bag is not None and self._bag.closed:
-            return  # stopped: others may still publish
+            return  # stopped, while others may still publish
         message = deserialize_message(raw, messages.message_type(kind))
         published = message.stamp.sec * 10**9 + message.stamp.nanosec
         try:
@@ -91,7 +90,7 @@ class Recording(Wiring):
             check_run(record, self.joined.run)
         except RecordError as error:
             if message.run_id == self.joined.run.run_id:
-                self._write(kind, raw, published)  # the bag tells what came, sound or not
+                self._write(kind, raw, published)  # the bag holds what arrived, sound or not
             self.member.traffic.refuse(kind, error)
             return
         self._write(kind, self._kept(record, raw, message), published)
@@ -99,7 +98,7 @@ class Recording(Wiring):
             self._last.hold(record, raw)
 
     def _kept(self, record: Record, raw: bytes, message: Any) -> bytes:
-        """What the bag keeps of a message: all, or of labels those that it is asked to keep."""
+        """The bytes that the bag keeps of a message: all, or only the first labels if so set."""
         if self._first is None or not isinstance(record, StepRewards):
             return raw
         kept = self._first.keep(record)
@@ -114,7 +113,7 @@ class Recording(Wiring):
         self._recorded[TOPICS[kind]] += 1
 
     def deliver(self, given: Record) -> None:
-        """Pass on a record of the core; a commit only once what it names is on the disk."""
+        """Publish a record of the core; a commit only after all that it names is on the disk."""
         link = self.member.link
         if not isinstance(given, Commit):
             super().deliver(given)
@@ -136,7 +135,7 @@ class Recording(Wiring):
 
     def _still_missing(self) -> dict[str, int]:
         member = self.member
-        due = member.peers.told()
+        due = member.peers.published()
         ours = published_by(member.role)
         due.update({t: n for t, n in member.link.published.items() if t in ours})
         commits = TOPICS[Commit]
@@ -146,9 +145,10 @@ class Recording(Wiring):
         }
 
     def settled(self, seconds: float) -> bool:
-        """Whether everybody has finished and all that they published is in the bag."""
+        """Whether all nodes have finished and all their records are in the bag."""
         peers, deadline = self.member.peers, self.member.deadline
-        running = [f'{p.said.role} {p.said.node}' for p in peers.newest() if not p.said.finished]
+        newest = [peer.presence for peer in peers.newest()]
+        running = [f'{p.role} {p.node}' for p in newest if not p.finished]
         missing = self.member.traffic.lost_for_good = self._still_missing()
         if not running and not missing:
             return True
@@ -157,9 +157,9 @@ class Recording(Wiring):
             f'waits for the end of {", ".join(running) or "nobody"} '
             f'and for {", ".join(lacking) or "nothing"}'
         )
-        # somebody who still publishes his presence may work as long as it takes
-        heard = max((p.heard for p in peers.by_instance.values()), default=0.0)
-        silent = time.monotonic() - heard
+        # a node that still publishes its presence may work as long as it needs
+        newest_at = max((p.received_at for p in peers.by_instance.values()), default=0.0)
+        silent = time.monotonic() - newest_at
         if deadline and min(seconds, silent) > deadline:
             self.log.error(f'gave up after {deadline:g} s: {self.member.doing}')
             return True

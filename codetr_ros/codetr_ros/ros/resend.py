@@ -1,4 +1,4 @@
-"""Sends a committed phase again, to a node that has not got all of it."""
+"""Sends a committed phase again to a node that lacks some of it."""
 
 from codetr_msgs.srv import FetchPhase
 
@@ -9,7 +9,7 @@ from codetr_ros.ros.link import Link
 
 
 class LastPhases:
-    """The received bytes of the last committed phases, and of what no commit has named yet."""
+    """The received bytes of the last committed phases, and of records that no commit names yet."""
 
     def __init__(self, phases: int) -> None:
         self._open: dict[tuple[type, str, int], bytes] = {}
@@ -17,14 +17,14 @@ class LastPhases:
         self._phases = phases
 
     def hold(self, record: Record, raw: bytes) -> None:
-        """Keep the bytes of a record that the core has taken: a commit will name it."""
+        """Keep the bytes of a record that the core has taken, until a commit names it."""
         if isinstance(record, Transitions):
             self._open[Transitions, record.source, record.sequence] = raw
         elif isinstance(record, CompositeReward):
             self._open[CompositeReward, record.scorer, record.sequence] = raw
 
     def commit(self, commit: Commit, raw: bytes) -> None:
-        """File under the commit's phase what it names; forget the oldest phase."""
+        """File the records that a commit names under its phase; forget the oldest phase."""
         last: dict[tuple[type, str], int] = {
             (Transitions, s): n
             for s, n in zip(commit.sources, commit.transitions.tolist(), strict=True)
@@ -44,7 +44,7 @@ class LastPhases:
         """Kind and bytes of each message of a committed phase.
 
         Raises:
-            KeyError: the phase is not held; the message says which ones are.
+            KeyError: the phase is not held; the message names those that are.
         """
         if phase not in self._committed:
             held = ', '.join(map(str, sorted(self._committed))) or 'none yet'
@@ -73,11 +73,11 @@ class Resender(LastPhases):
         if request.run_id != self._run_id:
             response.reason = (
                 f'this recorder is of run {self._run_id!r}, not {request.run_id!r}: ask that of '
-                f'your run'
+                'your run'
             )
             return response
         try:
-            found = self.get(request.phase)
+            phase = self.get(request.phase)
         except KeyError as error:
             response.reason = str(error.args[0])
             return response
@@ -85,7 +85,7 @@ class Resender(LastPhases):
             f'{request.requester} lacks something of phase {request.phase}: sending it again'
         )
         response.found = True
-        response.types = [type_name(kind) for kind, _ in found]
-        response.lengths = [len(raw) for _, raw in found]
-        response.cdr = b''.join(raw for _, raw in found)
+        response.types = [type_name(kind) for kind, _ in phase]
+        response.lengths = [len(raw) for _, raw in phase]
+        response.cdr = b''.join(raw for _, raw in phase)
         return response

@@ -1,8 +1,8 @@
-"""Stop on SIGINT and SIGTERM without a traceback, whatever the process is doing.
+"""Stop on SIGINT and SIGTERM without a traceback, at any moment of the process.
 
-rclpy's own handlers shut the context down from a thread, which races with everything that still
+rclpy's own handlers shut the context down from a thread. That races with everything that still
 publishes (a double `shutdown`, publishing on an invalid context, a KeyboardInterrupt in the middle
-of a record). Here a signal sets a flag, which the main loop looks at; a second signal changes
+of a record). Here a signal sets a flag, and the main loop checks it. A second signal changes
 nothing.
 """
 
@@ -16,7 +16,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Stop:
-    """True once somebody has asked the process to stop."""
+    """True once a signal has asked the process to stop."""
 
     def __init__(self) -> None:
         self.signal: signal.Signals | None = None
@@ -30,18 +30,18 @@ class Stop:
             self.signal = signal.Signals(number)
 
     def install(self) -> 'Stop':
-        """Take the two signals; call it first of all, before anything slow is imported."""
+        """Handle the two signals from now on. Call it first, before any slow import."""
         for number in SIGNALS:
             signal.signal(number, self._note)
         self._installed = True
         return self
 
     def end_within(self, seconds: int, code: int) -> None:
-        """Have this process end with an exit code if it is still there after that long.
+        """End this process with an exit code if it still runs after that many seconds.
 
-        For its last moments, when everything is saved: a middleware that hangs while it shuts down
-        (seen, rarely, under load) holds the interpreter, and nothing written in Python could end
-        it. A second before the end, it is written to standard error where the process hangs.
+        For its last moments, when everything is saved. A middleware that hangs during shutdown
+        (seen, rarely, under load) holds the interpreter, and no Python code could end the process.
+        A second before the end, a traceback on standard error shows where it hangs.
         """
         if self._installed:
             faulthandler.dump_traceback_later(max(seconds - 1, 0.1))
@@ -49,7 +49,7 @@ class Stop:
 
 
 def ignore() -> None:
-    """Ignore both from now on: last of all, since an interpreter that ends restores the deadly
+    """Ignore both from now on. Call it last: an interpreter that ends restores the deadly
     defaults.
     """
     for number in SIGNALS:

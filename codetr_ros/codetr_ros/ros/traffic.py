@@ -1,4 +1,4 @@
-"""What reaches the core of a node, and how its messages fare."""
+"""Hands records to the core of a node, and counts its messages."""
 
 import time
 from collections import Counter
@@ -13,12 +13,12 @@ class Traffic:
     """Hands records to the node's core and counts them, by topic.
 
     Attributes:
-        core: who takes the records; a silent one until the node has joined.
-        received: records that came, sound or not.
+        core: takes the records; a silent one until the node has joined.
+        received: records that arrived, sound or not.
         refused: those of them that were refused.
-        recovered: records that were lost, and came when they were asked for again.
-        ledger: what peers say they have published.
-        lost_for_good: what will not come any more, once that is certain.
+        recovered: records that were lost, and arrived when fetched again.
+        ledger: counts of the records that peers have published.
+        lost_for_good: records that will not arrive any more, once that is certain.
 
     Args:
         log: the node's logger.
@@ -34,7 +34,7 @@ class Traffic:
         self.lost_for_good: dict[str, int] | None = None
 
     def receive(self, record: Record) -> bool:
-        """Hand a record to the core; whether it was new and taken."""
+        """Hand a record to the core; returns whether it was new and taken."""
         before = self.core.duplicated.total()
         try:
             self.core.receive(record)
@@ -44,8 +44,8 @@ class Traffic:
         return self.core.duplicated.total() == before
 
     def receive_again(self, record: Record) -> None:
-        """Hand over a record that came because it was asked for; what is new was lost before."""
-        # who asks for what a commit names has the commit
+        """Hand over a record that was fetched again; one that is new was lost before."""
+        # a node that fetches what a commit names has the commit
         if self.receive(record) and not isinstance(record, Commit):
             self.recovered[TOPICS[type(record)]] += 1
 
@@ -58,8 +58,8 @@ class Traffic:
             self._log.error(f'refused on {topic!r} (number {n}): {error}')
 
     def lost(self) -> dict[str, int]:
-        """Records that peers published a while ago, as their presence has it, and that have not
-        come, not even when they were asked for again.
+        """Counts of the records that peers published a while ago, according to their presence,
+        and that never arrived, not even when fetched again.
         """
         if self.lost_for_good is not None:
             return self.lost_for_good

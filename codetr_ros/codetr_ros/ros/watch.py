@@ -1,5 +1,5 @@
-"""Sees a run from outside: presence, task, episodes, metrics and commits of a namespace, for
-progress and summary.
+"""Watches a run from outside, for progress and summary: presence, task, episodes, metrics and
+commits of a namespace.
 """
 
 from collections.abc import Callable
@@ -28,19 +28,19 @@ from codetr_ros.records import (
 from codetr_ros.ros import messages, qos
 
 WATCHED = (RunSpec, Presence, TaskSpec, Commit, EpisodeResult, Metrics)
-"""What tells how a run goes; the data themselves are left alone."""
+"""Records that show how a run is going; the data themselves are left alone."""
 DEPTH = 10_000
-"""The settings, and with them what may be under way, are not known when watching begins."""
+"""A fixed depth: the settings, which decide how much may be under way, are not known yet."""
 
 
 class Watcher:
-    """Hands every record that tells how a run goes to a function. A context manager.
+    """Hands every record that shows how a run is going to a function. A context manager.
 
-    It has a ROS context of its own, takes no signals, and counts for nobody as a peer.
+    It has a ROS context of its own, handles no signals, and no node counts it as a peer.
 
     Args:
         on_record: called by `poll`, in the thread that polls.
-        namespace: of the run, such as '/run_1'.
+        namespace: namespace of the run, such as '/run_1'.
         name: node name.
     """
 
@@ -86,10 +86,10 @@ class Watcher:
         self._inbox.append(message)
 
     def poll(self, timeout: float) -> int:
-        """Wait until something arrives, at most `timeout` seconds, and hand over all that has.
+        """Wait at most `timeout` seconds until something arrives, and hand over all that has.
 
         Returns:
-            How many records were handed over.
+            How many messages arrived.
         """
         try:
             self._executor.spin_once(timeout_sec=timeout)

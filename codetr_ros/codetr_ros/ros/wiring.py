@@ -1,4 +1,4 @@
-"""How the core of a node is wired to the topics of its run."""
+"""Wires the core of a node to the topics of its run."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,11 +11,11 @@ from codetr_ros.runs.reports import BagReport
 
 
 class Wiring:
-    """The wiring of most nodes: what the core subscribes to goes in, what it yields goes out.
+    """The wiring of most nodes: records that the core subscribes to go in, those it yields go out.
 
     Args:
         member: the node's membership.
-        joined: what it has joined.
+        joined: the run that it has joined.
     """
 
     def __init__(self, member: Membership, joined: Joined) -> None:
@@ -24,7 +24,7 @@ class Wiring:
         self.log = member.log
 
     def enter(self) -> None:
-        """Open the topics, and be known as one who has joined."""
+        """Open the topics, and publish that the node has joined."""
         run, settings = self.joined.run, self.joined.settings
         self.member.link.advertise(published_by(self.member.role), settings)
         self.open()
@@ -41,18 +41,16 @@ class Wiring:
         self.member.take(kind, message)
 
     def complete(self) -> bool:
-        """Do what must be done before the peers can all be there; false if asked to stop
-        meanwhile.
-        """
+        """Do what must precede the arrival of all peers; false if asked to stop meanwhile."""
         return True
 
     def lacking(self) -> list[str]:
-        """Who is not there yet, or not matched."""
+        """The peers that are absent or not matched yet, in words."""
         run, settings = self.joined.run, self.joined.settings
         return absent_or_unmatched(self.member, settings, run.settings_hash, settings.roles)
 
     def deliver(self, given: Any) -> None:
-        """Pass on what the core yielded: a record."""
+        """Publish what the core yielded: a record."""
         self.member.link.publish(given)
 
     def waits(self) -> str:
@@ -60,11 +58,11 @@ class Wiring:
         return f'waits for {self.joined.core.waiting_for()}'
 
     def settled(self, seconds: float) -> bool:
-        """Whether a node whose core has finished `seconds` ago may end."""
+        """Whether the node may end, `seconds` after its core has finished."""
         return True
 
     def close(self) -> None:
-        """Finish what the wiring itself holds open, once nothing more will arrive."""
+        """Close what the wiring itself holds open, once nothing more will arrive."""
 
     def report(self) -> BagReport | None:
         """What the wiring adds to the core's report."""
@@ -72,4 +70,4 @@ class Wiring:
 
 
 Wire = Callable[[Membership, Joined], Wiring]
-"""Makes the wiring of a node that has joined; opens nothing yet."""
+"""Makes the wiring of a node that has joined, without opening anything."""
