@@ -1,4 +1,4 @@
-"""The sources of a run, as they have announced themselves, and what they simulate."""
+"""The sources of a run that have announced themselves, and what they simulate."""
 
 import logging
 from collections import Counter
@@ -27,11 +27,11 @@ class Tasks:
         self._settings = settings
         self.specs: dict[str, TaskSpec] = {}
         self._unannounced: list[Transitions] = []
-        self.refused: Counter[str] = Counter()  # of what waited for its announcement
+        self.refused: Counter[str] = Counter()  # steps that waited for their announcement
 
     @property
     def known(self) -> bool:
-        """Whether all sources of the run have said what they simulate."""
+        """Whether all sources of the run have announced what they simulate."""
         return len(self.specs) == self._settings.source_count
 
     @property
@@ -45,26 +45,24 @@ class Tasks:
         return tuple(sorted(self.specs))
 
     def receive(self, spec: TaskSpec) -> None:
-        """Take what a simulator says it simulates.
+        """Take the announcement of what a source simulates.
 
         Raises:
-            RecordError: another run, protocol, task, size, or a simulator too many.
+            RecordError: it is of another run, protocol, task or size, or one simulator too many.
         """
         check_run(spec, self._run)
         if spec.protocol_version != PROTOCOL_VERSION:
             raise RecordError(
                 f'{spec.source!r} speaks protocol {spec.protocol_version}, this node '
-                f'{PROTOCOL_VERSION}: install the same '
-                f'version of codetr_ros on both'
+                f'{PROTOCOL_VERSION}: install the same version of codetr_ros on both'
             )
         for known in self.specs.values():
             for name in ('task', 'observation_size', 'action_size', 'horizon', 'r_max'):
                 if getattr(known, name) != getattr(spec, name):
                     raise RecordError(
                         f'{spec.source!r} has {name}={getattr(spec, name)!r}, {known.source!r} '
-                        'has '
-                        f'{getattr(known, name)!r}: all simulators of a run must simulate the '
-                        'same task'
+                        f'has {getattr(known, name)!r}: all simulators of a run must simulate '
+                        'the same task'
                     )
         if spec.source not in self.specs and self.known:
             raise RecordError(
@@ -75,25 +73,25 @@ class Tasks:
         self.specs[spec.source] = spec
 
     def announce(self, spec: TaskSpec, receive: Callable[[Transitions], None]) -> None:
-        """Take an announcement, then hand what waited for it to `receive`.
+        """Take an announcement, then hand the steps that waited for it to `receive`.
 
         Raises:
-            RecordError: as `receive` of this class; what waited is then still waiting.
+            RecordError: as `receive` of this class; the steps then wait on.
         """
         self.receive(spec)
         waiting, self._unannounced = self._unannounced, []
         for chunk in waiting:
             try:
                 receive(chunk)
-            except RecordError as error:  # its fault, not that of the announcement
+            except RecordError as error:  # the steps' fault, not that of the announcement
                 self.refused[TOPICS[Transitions]] += 1
                 _log.error('%s', error)
 
     def admit(self, chunk: Transitions) -> bool:
-        """Whether steps may be taken in now; those that came before their announcement wait.
+        """Whether steps may be taken in now; those that arrive before their announcement wait.
 
         Raises:
-            RecordError: they are of no simulator of this run, or the task cannot have them.
+            RecordError: no simulator of this run made them, or they do not fit the task.
         """
         spec = self.specs.get(chunk.source)
         if spec is not None:

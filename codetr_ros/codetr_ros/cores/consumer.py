@@ -1,4 +1,4 @@
-"""What learner and reward side have in common: a memory fed by commits, checkpoints, a report."""
+"""The common part of learner and reward side: a memory fed by commits, checkpoints, a report."""
 
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -25,9 +25,9 @@ class Consumer(Part, ABC):
         run: the run.
         settings: its settings.
         name: node name.
-        folder: where checkpoints go; None keeps none.
+        folder: where checkpoints go; None: no checkpoints.
         scores: whether composite rewards are taken in.
-        true_rewards: whether the environment's own rewards are: the in-process oracle only.
+        true_rewards: whether the environment's own rewards are taken in: in-process oracle only.
     """
 
     role: ClassVar[str]
@@ -57,19 +57,19 @@ class Consumer(Part, ABC):
 
     @property
     def missing(self) -> int | None:
-        """A committed phase of which something has not arrived."""
+        """A committed phase that is incomplete; None if there is none."""
         return self._intake.missing
 
     def receive(self, record: Record) -> None:
         """Hold a record until its phase's turn.
 
         Raises:
-            RecordError: it must not be taken in; nothing has changed.
+            RecordError: it must be refused; nothing has changed then.
         """
         self._intake.receive(record)
 
     def work(self) -> Iterator[list[Record] | None]:
-        """Algorithm 1 as this side sees it; one slice per `next()`."""
+        """This side of Algorithm 1; one slice per `next()`."""
         while not self._intake.tasks.known:
             yield None
         spec, settings = self._intake.tasks.first, self._settings
@@ -85,7 +85,7 @@ class Consumer(Part, ABC):
         for phase in range(settings.phases):
             while not self._intake.take(phase, self._memory):
                 yield None
-            # the warm-up's phases are kept, and learnt from at its end
+            # the phases of the warm-up are stored, and learnt from at its end
             learns = phase >= settings.warmup_phases - 1
             yield from self._learn(phase, self._memory, learns)
             if learns:
@@ -97,24 +97,24 @@ class Consumer(Part, ABC):
 
     @abstractmethod
     def _begin(self) -> Iterator[list[Record]]:
-        """Make what is trained, now that sizes are known; what to say before the first phase."""
+        """Make what is trained, for sizes known now; yield the records before the first phase."""
 
     @abstractmethod
     def _learn(
         self, phase: int, memory: Trajectories, learns: bool
     ) -> Iterator[list[Record] | None]:
-        """What follows on a phase that was taken in; sets `_phase` before its last word."""
+        """Handle a phase that was taken in; sets `_phase` before it yields its last records."""
 
     @abstractmethod
     def _state(self) -> dict[str, torch.Tensor]:
-        """What a checkpoint holds."""
+        """The tensors that a checkpoint holds."""
 
     def _metrics(self, phase: int, values: Mapping[str, float]) -> Metrics:
         step = self._settings.steps_after(phase)
         return records.metrics(self._run.run_id, self.role, self._name, phase, step, values)
 
     def close(self) -> None:
-        """Save a checkpoint of the last finished phase, unless there is one or no folder."""
+        """Save a checkpoint of the last finished phase, unless it exists or there is no folder."""
         done = self._phase - 1
         if self._folder is None or self._memory is None or self._saved == done:
             return

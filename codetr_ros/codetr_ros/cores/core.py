@@ -1,4 +1,4 @@
-"""The shape of every part of a run, whoever wires it."""
+"""The interface of every part of a run, over topics or in process."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -8,41 +8,43 @@ from codetr_ros.records import Record
 from codetr_ros.runs.reports import CoreReport
 
 Given_co = TypeVar('Given_co', covariant=True)
-"""What a core gives out: records, or whatever stands for them."""
+"""What a core yields: records, or what represents them."""
 
 
 class Core(Protocol[Given_co]):
-    """What every part of a run is, whoever wires it: it takes records in, works in slices, gives
-    records out.
+    """A part of a run, over topics or in process: it takes records in, works in slices and yields
+    records.
     """
 
     @property
     def subscribes(self) -> tuple[type, ...]:
-        """Kinds of records that it takes in."""
+        """The kinds of records that it takes in."""
 
     @property
     def finished(self) -> bool:
-        """Whether it has done all that the run asks of it."""
+        """Whether it has done everything that the run asks of it."""
 
     @property
     def missing(self) -> int | None:
-        """A committed phase of which something has not arrived; None if there is none."""
+        """A committed phase that is incomplete; None if there is none."""
 
     @property
     def duplicated(self) -> 'Counter[str]':
-        """Records that came again and were dropped, by topic."""
+        """Counts of records that arrived again and were dropped, by topic."""
 
     @property
     def refused(self) -> 'Counter[str]':
-        """Records that `receive` took and that were refused later, by topic."""
+        """Counts of records that `receive` took and that were refused later, by topic."""
 
     def receive(self, record: Record) -> None:
-        """Store a record; raises `RecordError` for what must be refused, and has then changed
-        nothing.
+        """Store a record.
+
+        Raises:
+            RecordError: it must be refused; nothing has changed then.
         """
 
     def work(self) -> Iterator[Sequence[Given_co] | None]:
-        """One slice for each `next()`: the records that became ready, or None while there is
+        """Work one slice for each `next()`; yields the records that are ready, or None if there is
         nothing to do.
         """
 
@@ -50,14 +52,14 @@ class Core(Protocol[Given_co]):
         """What the next slice waits for, for people."""
 
     def close(self) -> None:
-        """Save what must outlast the process; harmless when called again."""
+        """Save what must outlast the process; a second call does no harm."""
 
     def report(self) -> CoreReport:
-        """What to say in the run's summary."""
+        """What the core contributes to the run's summary."""
 
 
 class Part:
-    """What most cores have in common: nothing missing, nothing counted, any message awaited."""
+    """The defaults of most cores: nothing is missing or counted, and any message is awaited."""
 
     finished = False
 
@@ -67,7 +69,7 @@ class Part:
 
     @property
     def missing(self) -> int | None:
-        """A committed phase of which something has not arrived; None if there is none."""
+        """A committed phase that is incomplete; None if there is none."""
         return None
 
     def waiting_for(self) -> str:
@@ -76,13 +78,13 @@ class Part:
 
 
 class Silent(Part):
-    """A core that takes nothing in and gives nothing out: of a node that has no other (yet)."""
+    """A core that takes nothing in and yields no record: for a node without another (yet)."""
 
     subscribes: tuple[type, ...] = ()
     finished = True
 
     def receive(self, record: Record) -> None:
-        """Nothing is subscribed to."""
+        """Do nothing: no record is subscribed to."""
 
     def work(self) -> Iterator[list[Record] | None]:
         """Nothing to do."""

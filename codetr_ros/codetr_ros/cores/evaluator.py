@@ -1,4 +1,4 @@
-"""The evaluator: how good the policies are, without noise, beside the run and never in its way."""
+"""The evaluator: measures the policies without noise, beside the run, and never delays it."""
 
 from collections import Counter, deque
 from collections.abc import Iterator
@@ -18,9 +18,8 @@ from codetr_ros.simulation.tasks import make
 class Evaluator(Part):
     """Evaluates policy versions: `evaluate_episodes` episodes each, with deterministic actions.
 
-    Every evaluation of a run begins its episodes in the same start states. The first is that of
-    the uniformly random policy, from which everything starts. With `evaluate_every` = 0 there is
-    none at all.
+    Every evaluation of a run begins its episodes in the same start states. The first evaluation is
+    that of the uniformly random policy, the baseline. With `evaluate_every` = 0 there is none.
 
     Args:
         run: the run it belongs to.
@@ -52,7 +51,7 @@ class Evaluator(Part):
         """Keep a policy whose version is due for evaluation.
 
         Raises:
-            RecordError: it is of another run, or its weights do not fit. Nothing has changed.
+            RecordError: it is of another run, or its weights do not fit; nothing has changed then.
         """
         settings = self._settings
         policy = check_policy(record, self._run, settings, f'evaluator {self._name!r}')
@@ -68,7 +67,7 @@ class Evaluator(Part):
             self._waiting.append(('evaluation', policy.version, acting))
 
     def work(self) -> Iterator[list[Record] | None]:
-        """One episode per slice."""
+        """Evaluate one episode per slice."""
         while True:
             if not self._waiting:
                 yield None
@@ -85,7 +84,7 @@ class Evaluator(Part):
     def _evaluate(
         self, purpose: str, version: int, acting: ActingPolicy | None, number: int
     ) -> EpisodeResult:
-        """One episode, from the start state that its number stands for."""
+        """Run one episode, from the start state that its number gives."""
         seed, episode, environment = self._settings.seed, self._episode, self._environment
         episode.reset(int(generator(seed, 'evaluate', number).integers(2**31)))
         if acting is None:

@@ -1,9 +1,9 @@
 """Algorithm 1 with plain calls instead of topics: the same cores, in the same order, in one
 process.
 
-With the same seed, pace and thread count a run over topics ends with the same weights as this one.
-Everything takes its turn here, so that evaluation, too, makes the run longer by the time that it
-takes; over topics no phase waits for it.
+A run over topics with the same seed, pace and thread count ends with the same weights. Here the
+parts take turns, so evaluation lengthens the run by its own time; over topics no phase waits for
+it.
 """
 
 import logging
@@ -41,15 +41,16 @@ def run(
     Args:
         settings: the run's settings.
         run_id: its name.
-        folder: where checkpoints and reports go; None keeps none.
-        observe: is handed every record, in order. What it raises ends the run, after a checkpoint.
-        tick: is called after every slice of work; the same holds for what it raises.
+        folder: where checkpoints and reports go; None: neither is written.
+        observe: called with every record, in order. An error that it raises ends the run, after a
+            checkpoint.
+        tick: called after every slice of work; an error that it raises does the same.
 
     Returns:
         A report for each part of the run, as the nodes write them.
 
     Raises:
-        RuntimeError: every part waits for another: a fault of this program.
+        RuntimeError: every part waits for another, which is a fault of this program.
     """
     torch.set_num_threads(settings.threads)
     spec = settings.run_spec(run_id)
@@ -91,8 +92,8 @@ def run(
             if idle and not finished:
                 waiting = [name for name, (_, core) in cores.items() if not core.finished]
                 raise RuntimeError(
-                    f'every part of the run waits for another: {", ".join(waiting)} have not '
-                    'finished'
+                    'every part of the run waits for another: '
+                    f'{", ".join(waiting)} have not finished'
                 )
     finally:
         reports = {}

@@ -1,5 +1,5 @@
-"""What both consumers do with arriving records: check them once, hold what came early, give out
-what a commit names.
+"""How both consumers treat records: they check each once, hold the early ones, and take in those
+that a commit names.
 """
 
 import logging
@@ -27,14 +27,13 @@ _log = logging.getLogger(__name__)
 
 
 class Intake:
-    """Holds what arrived until a commit says to which phase it belongs, then adds it to the memory
-    in order.
+    """Holds records until a commit names their phase, then adds them to the memory in order.
 
     Args:
         run: the run to which everything must belong.
         settings: its settings.
         scores: whether composite rewards are taken in too.
-        true_rewards: whether the environment's own rewards are: the in-process oracle only.
+        true_rewards: whether the environment's own rewards are taken in: in-process oracle only.
     """
 
     def __init__(
@@ -55,13 +54,13 @@ class Intake:
         }  # next sequence number due
         self.duplicated: Counter[str] = Counter()
         self.refused = self.tasks.refused
-        self.missing: int | None = None  # a committed phase of which something has not arrived
+        self.missing: int | None = None  # a committed phase that is incomplete
 
     def receive(self, record: Record) -> None:
         """Check a record and hold it.
 
         Raises:
-            RecordError: it must not be taken in; nothing has changed.
+            RecordError: it must be refused; nothing has changed then.
         """
         check_run(record, self._run)
         if isinstance(record, TaskSpec):
@@ -99,15 +98,15 @@ class Intake:
             held[key] = record
 
     def take(self, phase: int, memory: Trajectories) -> bool:
-        """Add everything that the phase's commit names to the memory, ordered by source and
+        """Add all records that the phase's commit names to the memory, ordered by source and
         number.
 
         Returns:
-            Whether it was all there. If not, nothing was added, and `missing` is the phase where
+            Whether all of them were there. If not, nothing was added; `missing` is the phase if
             its commit is known.
 
         Raises:
-            RecordError: what is committed contradicts itself: the run cannot go on.
+            RecordError: the committed records contradict each other: the run cannot go on.
         """
         commit = self._commits.get(phase)
         if commit is None:
@@ -132,9 +131,7 @@ class Intake:
             del self._rewards[reward.scorer, reward.sequence]
             try:
                 memory.score(reward)
-            except (
-                RecordError
-            ) as error:  # a wrong score spoils no run: it is said, counted, and left out
+            except RecordError as error:  # a wrong score is logged, counted and left out
                 self.refused[TOPICS[CompositeReward]] += 1
                 _log.error('%s', error)
         for names, last, kind in (
@@ -149,10 +146,10 @@ class Intake:
     def _named(
         self, names: tuple[str, ...], last: Any, held: dict[tuple[str, int], Any], kind: str
     ) -> list[Any] | None:
-        found = []
+        named = []
         for name, number in sorted(zip(names, last.tolist(), strict=True)):
             for sequence in range(self._taken[kind][name], number + 1):
                 if (name, sequence) not in held:
                     return None
-                found.append(held[name, sequence])
-        return found
+                named.append(held[name, sequence])
+        return named

@@ -1,4 +1,4 @@
-"""The reward side's part of Algorithm 1: take a phase in, fit, label, say what changed."""
+"""The reward side of Algorithm 1: take a phase in, fit, label, publish the changed labels."""
 
 import time
 from collections import Counter
@@ -37,13 +37,13 @@ class Labeller(Consumer):
         run: the run.
         settings: its settings.
         name: node name.
-        folder: where checkpoints go; None keeps none.
+        folder: where checkpoints go; None: no checkpoints.
         checkpoint: a saved reward model to start from (`saved.read`); empty: a new one.
-        frozen: only label, as the checkpoint has it; else it goes on learning.
+        frozen: only label with the checkpoint; else the model goes on learning.
 
     Raises:
-        CheckpointError: there is no such checkpoint, or it is damaged.
-        RewardModelError: `frozen` without a checkpoint.
+        CheckpointError: the checkpoint does not exist, or is damaged.
+        RewardModelError: `frozen` is set without a checkpoint.
     """
 
     role = 'reward'
@@ -94,14 +94,14 @@ class Labeller(Consumer):
         assert method is not None
         if not learns:
             self._phase = phase + 1
-            # said of every phase: who plays a recorded run waits for it
+            # published for every phase, because the player of a recorded run waits for it
             yield [self._metrics(phase, {'gradient_steps': method.gradient_steps})]
             return
         if len(memory.segments.ids()) and not self._frozen:
             method.prepare(memory)
         metrics: dict[str, float] = {}
-        for said in self._fit(phase, memory, method):
-            metrics |= said
+        for means in self._fit(phase, memory, method):
+            metrics |= means
             yield []
         began = time.perf_counter()
         parts: list[StepRewards] = []
@@ -131,7 +131,7 @@ class Labeller(Consumer):
         began = time.perf_counter()
         sums: Counter[str] = Counter()
         for i in range(steps):
-            # a stream of its own: neither interleaving nor a restart changes what it draws
+            # its own random stream: neither interleaving nor a restart changes what it draws
             seed_torch(self._settings.seed, 'reward', phase, i)
             rng = generator(self._settings.seed, 'reward', phase, i)
             sums.update(method.gradient_step(memory, rng))
@@ -143,10 +143,10 @@ class Labeller(Consumer):
     def _label(
         self, phase: int, memory: Trajectories, method: RewardMethod
     ) -> Iterator[list[StepRewards]]:
-        """Label what is new, and of what has changed as much as the settings ask for.
+        """Label all new steps, and as many of the old ones as the settings ask for.
 
-        The memory takes the labels in as that of the learner will: it then tells what is labelled,
-        by which version, and what the learner will draw.
+        The memory takes the labels in as the learner's memory will. So it shows which steps are
+        labelled, by which version, and which the learner will draw.
         """
         segments = due.segments_due(memory, method.version, self._settings)
         yield from self._whole(phase, memory, method, segments)
@@ -178,8 +178,8 @@ class Labeller(Consumer):
         labels: F32,
         version: int,
     ) -> list[StepRewards]:
-        """Labels of spans of steps, which lie where `Segments.spans` states."""
-        found = []
+        """Apply labels of spans of steps to the memory; the records that carry them."""
+        pieces = []
         at = 0
         for source, *where in spans:
             lengths = where[2]
@@ -190,7 +190,7 @@ class Labeller(Consumer):
                 steps = int(lengths[begin:end].sum())
                 episodes, firsts, counts = (a[begin:end].astype(np.uint32) for a in where)
                 part = labels[at : at + steps].copy()
-                found.append(
+                pieces.append(
                     StepRewards(
                         run_id=self._run.run_id,
                         phase=phase,
@@ -206,17 +206,17 @@ class Labeller(Consumer):
                 )
                 at += steps
                 begin = end
-        for record in found:
-            memory.apply(record)
-        return found
+        for piece in pieces:
+            memory.apply(piece)
+        return pieces
 
-    def _numbered(self, phase: int, version: int, found: list[StepRewards]) -> list[StepRewards]:
-        """Join small batches into parts as large as may be, source by source, and number them; at
-        least one, if empty.
+    def _numbered(self, phase: int, version: int, pieces: list[StepRewards]) -> list[StepRewards]:
+        """Join small pieces, source by source, into parts as large as allowed, and number them. If
+        there are none, one empty part.
         """
         parts: list[list[StepRewards]] = []
         size = MESSAGE_BYTES
-        for piece in sorted(found, key=lambda piece: piece.source):
+        for piece in sorted(pieces, key=lambda piece: piece.source):
             weight = len(piece.labels) * 4 + len(piece.lengths) * 12
             if size + weight > MESSAGE_BYTES or parts[-1][0].source != piece.source:
                 parts.append([])
@@ -246,13 +246,13 @@ class Labeller(Consumer):
                 version=version,
                 part=i,
                 parts=len(parts),
-                source=pieces[0].source,
-                episodes=np.concatenate([p.episodes for p in pieces]),
-                first_steps=np.concatenate([p.first_steps for p in pieces]),
-                lengths=np.concatenate([p.lengths for p in pieces]),
-                labels=np.concatenate([p.labels for p in pieces]),
+                source=part[0].source,
+                episodes=np.concatenate([piece.episodes for piece in part]),
+                first_steps=np.concatenate([piece.first_steps for piece in part]),
+                lengths=np.concatenate([piece.lengths for piece in part]),
+                labels=np.concatenate([piece.labels for piece in part]),
             )
-            for i, pieces in enumerate(parts)
+            for i, part in enumerate(parts)
         ]
 
     def _state(self) -> dict[str, torch.Tensor]:
@@ -277,20 +277,20 @@ class Labeller(Consumer):
 def _joined(
     method: RewardMethod, passes: Iterator[F32]
 ) -> Generator[list[StepRewards], None, F32]:
-    """Labels from all forward passes, a slice each.
+    """Labels from all forward passes, one slice each.
 
     Raises:
-        RewardModelError: one is not finite.
+        RewardModelError: a label is not finite.
     """
-    found = []
+    batches = []
     for labels in passes:
-        found.append(labels)
+        batches.append(labels)
         yield []
-    joined: F32 = np.concatenate(found)
+    joined: F32 = np.concatenate(batches)
     if not np.isfinite(joined).all():
         raise RewardModelError(
-            f'labels of method {method.name!r} are not finite after '
-            f'{method.gradient_steps} gradient steps: training has diverged. '
-            'Lower its learning_rate, or set target_scale=rms'
+            f'labels of method {method.name!r} are not finite after {method.gradient_steps} '
+            'gradient steps: training has diverged. Lower its learning_rate, or set '
+            'target_scale=rms'
         )
     return joined

@@ -1,4 +1,4 @@
-"""The learner's part of Algorithm 1: permit, take in, learn, permit again."""
+"""The learner's side of Algorithm 1: permit a phase, take it in, learn, permit the next."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -36,17 +36,17 @@ class Learner(Consumer):
         run: the run.
         settings: its settings.
         name: node name.
-        folder: where checkpoints go; None keeps none.
+        folder: where checkpoints go; None: no checkpoints.
 
     Raises:
-        DeviceError: the device of the settings is not here.
+        DeviceError: this machine lacks the device of the settings.
     """
 
     role = 'learner'
     subscribes = subscribed('learner')
 
     def __init__(self, run: RunSpec, settings: Settings, name: str, folder: Path | None) -> None:
-        usable(settings.device)  # a device that is not here is said at once
+        usable(settings.device)  # refuse a missing device at once
         self.subscribes = subscribed('learner', settings.labels_steps)
         super().__init__(run, settings, name, folder, scores=not settings.labels_steps)
         self._labels: dict[int, dict[int, StepRewards]] = {}
@@ -56,7 +56,7 @@ class Learner(Consumer):
         """Hold a record until its phase's turn.
 
         Raises:
-            RecordError: it must not be taken in; nothing has changed.
+            RecordError: it must be refused; nothing has changed then.
         """
         if not isinstance(record, StepRewards):
             super().receive(record)
@@ -69,8 +69,8 @@ class Learner(Consumer):
             )
         if not np.isfinite(record.labels).all():
             raise RecordError(
-                f'{describe(record)}: labels[{int(np.argmin(np.isfinite(record.labels)))}] is not '
-                'finite'
+                f'{describe(record)}: '
+                f'labels[{int(np.argmin(np.isfinite(record.labels)))}] is not finite'
             )
         parts = self._labels.get(record.phase, {})
         others = next((part.parts for part in parts.values()), record.parts)
@@ -102,8 +102,8 @@ class Learner(Consumer):
                     yield None
                 for _, part in sorted(self._labels.pop(phase).items()):
                     self._counters['labels of evicted steps'] += memory.apply(part)
-            for said in learner.train(phase, memory):
-                metrics |= said
+            for values in learner.train(phase, memory):
+                metrics |= values
                 yield []
         metrics |= {
             'updates': learner.updates,
@@ -112,7 +112,7 @@ class Learner(Consumer):
             'memory_bytes': memory.nbytes,
         }
         self._phase = phase + 1
-        # the permission before the checkpoint: while it travels, the checkpoint is written
+        # permit before the checkpoint: the message travels while the checkpoint is written
         yield [self._permit(phase + self._settings.lag, phase), self._metrics(phase, metrics)]
 
     def _labelled(self, phase: int) -> bool:

@@ -1,7 +1,7 @@
-"""What a phase consists of: the recorder decides when it is whole and commits it.
+"""The recorder decides when a phase is whole, and commits it.
 
-The core knows nothing of bags. Whoever wires it writes everything it has been given to disk before
-passing a `Commit` on: what a node learns from is then never lost.
+The core knows nothing of bags. Its wiring writes every received record to disk before it publishes
+a `Commit`. So no record that a node learns from is ever lost.
 """
 
 import time
@@ -58,11 +58,11 @@ class Recorder(Part):
         self.phase = 0  # the next to be committed
 
     def receive(self, record: Record) -> None:
-        """Take note of what arrived.
+        """Note a record that arrived.
 
         Raises:
             RecordError: it is no part of this run, impossible, or out of sequence; nothing has
-                changed.
+                changed then.
         """
         check_run(record, self._run)
         if isinstance(record, TaskSpec):
@@ -89,8 +89,7 @@ class Recorder(Part):
         if record.sequence > due[name]:
             raise RecordError(
                 f'{describe(record)} is out of sequence: {due[name]} is the next of {name!r}. '
-                'What lies between never '
-                f'arrived: restart {name!r}'
+                f'What lies between never arrived: restart {name!r}'
             )
         if record.sequence < due[name]:
             self.duplicated[TOPICS[type(record)]] += 1
@@ -106,10 +105,11 @@ class Recorder(Part):
                 yield None
             seconds = time.perf_counter() - began
             step = self._settings.steps_after(phase)
-            said = metrics(
-                self._run.run_id, 'record', self._name, phase, step, {'phase_seconds': seconds}
-            )
-            yield [self._commit(phase), said]
+            values = {'phase_seconds': seconds}
+            yield [
+                self._commit(phase),
+                metrics(self._run.run_id, 'record', self._name, phase, step, values),
+            ]
             self.phase = phase + 1
         self.finished = True
         while True:
@@ -137,9 +137,7 @@ class Recorder(Part):
             last.append(sequence)
             self._committed_scores[source] += due
             scorers.add(source)
-        for scorer in scorers - set(
-            members
-        ):  # a person, an inspection: whatever they have said by now
+        for scorer in scorers - set(members):  # a person, an inspection: all scores so far
             self._committed_scores[scorer] = self._scores[scorer]
         names = tuple(sorted(s for s in scorers if self._committed_scores[s]))
         scores = np.array([self._committed_scores[s] - 1 for s in names], np.int64)
@@ -174,7 +172,7 @@ class Recorder(Part):
         return f'phase {self.phase} lacks ' + (', '.join(lacks) or 'nothing')
 
     def close(self) -> None:
-        """Nothing to save: the bag belongs to whoever wires this core."""
+        """Nothing to save: the bag belongs to the wiring of this core."""
 
     def report(self) -> CoreReport:
         """Counts for the run's summary."""

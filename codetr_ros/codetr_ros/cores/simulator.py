@@ -1,4 +1,4 @@
-"""A simulator: rolls out the steps that each policy permits and says what happened."""
+"""A simulator: rolls out the steps that each policy permits, and publishes what happened."""
 
 import time
 from collections import Counter
@@ -26,14 +26,13 @@ from codetr_ros.simulation.source import Source
 class Simulator(Part):
     """Rolls out a task under the policies that it receives, in the order of their phases.
 
-    With the setting `envs` above 1 it has as many environments, and each is a source of its own:
-    with its own name, seeds, episodes and sequence numbers, as those of another simulator would
-    have. Whoever receives, keeps, verifies or plays steps therefore need not know which process
-    they come from, and the memory D has one open episode for each source, as ever. What the
-    environments have in common is the process, the policy and the turn: a slice is one chunk of
-    each, one after the other in the order of their names. Threads do not pay: the parts of a step
-    that release the interpreter lock are too short (measured with eight environments and 16 cores,
-    docs/decisions).
+    With the setting `envs` above 1 it has that many environments. Each is a source of its own:
+    with its own name, seeds, episodes and sequence numbers, like that of another simulator.
+    So no receiver, bag, check or player needs to know which process steps come from, and the
+    memory D still has one open episode for each source. The environments share the process, the
+    policy and the turn: a slice is one chunk of each, in the order of their names. Threads do not
+    pay: the parts of a step that release the interpreter lock are too short (measured with eight
+    environments and 16 cores, docs/decisions).
 
     Args:
         run: the run it belongs to.
@@ -63,13 +62,13 @@ class Simulator(Part):
 
         Raises:
             RecordError: it is of another run, its phase has been run or is waiting, it names no
-                steps for a source of this simulator, or its weights do not fit. Nothing has
-                changed.
+                steps for a source of this simulator, or its weights do not fit; nothing has
+                changed then.
         """
         policy = check_policy(record, self._run, self._settings, f'simulator {self._name!r}')
         ends = not policy.steps.any()
         if ends and self.finished:
-            return  # with overlap two permit nothing; the second one serves the evaluator
+            return  # with overlap two policies permit nothing; the second serves the evaluator
         if policy.phase < self._phase or policy.phase in self._waiting:
             done = 'run' if policy.phase < self._phase else 'received'
             raise RecordError(
@@ -88,8 +87,8 @@ class Simulator(Part):
         self._waiting[policy.phase] = policy, acting
 
     def work(self) -> Iterator[list[Record] | None]:
-        """A chunk of each source per slice, of at most `CHUNK_STEPS` steps; first of all what is
-        simulated.
+        """Yield what is simulated, then per slice a chunk of each source, of at most `CHUNK_STEPS`
+        steps.
         """
         yield [source.spec() for source in self._sources]
         while not self.finished:
@@ -146,7 +145,7 @@ class Simulator(Part):
 
 
 def _transitions(records: list[Record]) -> Transitions:
-    """The transitions among the records of a chunk: the first of them."""
+    """The transitions among the records of a chunk: its first record."""
     first = records[0]
     assert isinstance(first, Transitions)
     return first
