@@ -1,7 +1,7 @@
-"""The processes of a run over topics: starting, watching and ending them. No ROS in here.
+"""Starts, watches and ends the processes of a run over topics. No ROS in here.
 
-However the parent ends, no process outlives it: each is asked to end (SIGINT), given a deadline
-and then killed, and should the parent itself be killed, the kernel sends them SIGINT.
+However the parent ends, no process outlives it. Each is asked to end (SIGINT) and killed after a
+deadline. If the parent itself is killed, the kernel sends them SIGINT.
 """
 
 import ctypes
@@ -23,14 +23,14 @@ from codetr_ros.records import roles
 from codetr_ros.runs import folder as run_folder
 
 STOP_DEADLINE = 20.0
-"""Seconds from SIGINT to SIGKILL: a node ends its present slice, then writes a checkpoint."""
+"""Seconds from SIGINT to SIGKILL, in which a node ends its slice and writes a checkpoint."""
 HURRIED_DEADLINE = 2.0
 """The same after a second Ctrl-C."""
-_POLL = 0.02  # seconds between looks at processes that are to end
+_POLL = 0.02  # seconds between checks of processes that are to end
 
 
 class LaunchError(RuntimeError):
-    """Processes that cannot be started: says which and what to do."""
+    """A process that cannot be started: the message names it and the remedy."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,9 @@ class Command:
     """One process to start.
 
     Attributes:
-        name: what people call it; its log is `<name>.log`.
+        name: its name for people; its log is `<name>.log`.
         role: one of `records.ROLES`.
-        arguments: the executable's path and its arguments.
+        arguments: the path of the executable and its arguments.
     """
 
     name: str
@@ -52,7 +52,7 @@ def executable(role: str, environ: Mapping[str, str] = os.environ) -> Path:
     """Find a node's executable: in this environment's prefix, else through AMENT_PREFIX_PATH.
 
     Raises:
-        LaunchError: it is in none of them; says where was looked and how to build or source the
+        LaunchError: it is in none of them; names the places, and how to build or source the
             workspace.
     """
     package, name = roles.TABLE[role].package, roles.TABLE[role].executable
@@ -72,14 +72,14 @@ def executable(role: str, environ: Mapping[str, str] = os.environ) -> Path:
 def commands(
     settings: Settings, run_id: str, folder: Path, environ: Mapping[str, str] = os.environ
 ) -> list[Command]:
-    """The processes of a run, in the order in which they start (any other would do).
+    """The processes of a run, in the order in which they start; any order would do.
 
     Raises:
         LaunchError: an executable is missing.
     """
     nodes = [(name, 'sim') for name in settings.simulator_names]
     nodes += [(role, role) for role in settings.roles if role != 'sim']
-    found = []
+    processes = []
     for name, role in nodes:
         arguments = [str(executable(role, environ)), '--ros-args', '-r', f'__ns:=/run_{run_id}']
         if role == 'sim' and name != 'sim':
@@ -90,12 +90,12 @@ def commands(
         for parameter, value in parameters.items():
             # ROS reads the value as YAML: without quotes, blanks and colons in a path break it.
             arguments += ['-p', f'{parameter}:={json.dumps(value, ensure_ascii=False)}']
-        found.append(Command(name, role, tuple(arguments)))
-    return found
+        processes.append(Command(name, role, tuple(arguments)))
+    return processes
 
 
 def environment(settings: Settings, environ: Mapping[str, str] = os.environ) -> dict[str, str]:
-    """The environment of a run's processes: this one's, with what the run needs."""
+    """The environment of a run's processes: that of this process, and what the run needs."""
     return {
         **middleware.DEFAULTS,
         'PYTHONUNBUFFERED': '1',
@@ -105,24 +105,23 @@ def environment(settings: Settings, environ: Mapping[str, str] = os.environ) -> 
 
 
 def threading_environment(settings: Settings) -> dict[str, str]:
-    """How many threads torch and numpy take, and how they wait."""
+    """Environment variables that set how many threads torch and numpy use, and how they wait."""
     return {
         'OMP_NUM_THREADS': str(settings.threads),
-        # Spinning OpenMP threads of several processes starve each other where cores are few.
+        # Spinning OpenMP threads of several processes starve each other on few cores.
         'OMP_WAIT_POLICY': 'PASSIVE',
     }
 
 
 def end_with_parent(number: signal.Signals = signal.SIGINT) -> Callable[[], None] | None:
-    """What a child calls before it becomes another program, so as not to outlive its parent.
+    """The function that a child calls between fork and exec, so as not to outlive its parent.
 
     Linux only (elsewhere None): prctl(PR_SET_PDEATHSIG) makes the kernel send the signal when the
-    parent dies (to be exact: the thread that started the child), however it dies, SIGKILL
-    included. Everything is looked up here: between fork and exec nothing but the call itself is
-    safe.
+    parent dies (to be exact: the thread that started the child), also by SIGKILL. Everything is
+    looked up here, because between fork and exec only the call itself is safe.
 
     Args:
-        number: the signal; SIGINT lets the child save what it has.
+        number: the signal; after SIGINT the child can still save its state.
     """
     if not sys.platform.startswith('linux'):
         return None
@@ -139,27 +138,27 @@ def end_with_parent(number: signal.Signals = signal.SIGINT) -> Callable[[], None
 
 
 class Process(Protocol):
-    """What is asked of a process that was started: a part of `subprocess.Popen`."""
+    """A started process: the part of `subprocess.Popen` that is needed."""
 
     @property
     def pid(self) -> int:
-        """Its number."""
+        """Its process id."""
 
     def poll(self) -> int | None:
-        """Exit code (negative: the signal that ended it), None while it runs."""
+        """Exit code (negative: the signal that ended it); None while it runs."""
 
     def wait(self, timeout: float | None = None) -> int:
-        """Wait until it has ended; its exit code."""
+        """Wait until it has ended; returns its exit code."""
 
 
 Start = Callable[[Sequence[str], Mapping[str, str], BinaryIO], Process]
-"""Starts a process: of a program's path and arguments, its environment and its log."""
+"""Starts a process from its path and arguments, its environment and its log."""
 
 
 def start_program(
     arguments: Sequence[str], environment: Mapping[str, str], log: BinaryIO
 ) -> Process:
-    """Start a program in a session of its own (Ctrl-C reaches only us), which ends when we do.
+    """Start a program that ends when we do, in a session of its own (Ctrl-C reaches only us).
 
     Raises:
         OSError: it cannot be started.
@@ -171,7 +170,7 @@ def start_program(
         stderr=subprocess.STDOUT,
         env=dict(environment),
         start_new_session=True,
-        # It makes one system call, looked up before: safe beside ROS's threads.
+        # One system call, looked up before: safe beside ROS's threads.
         preexec_fn=end_with_parent(),  # noqa: PLW1509
     )
 
@@ -183,12 +182,12 @@ class Node:
     command: Command
     process: Process
     log: Path
-    asked: bool = False  # to end, by a signal of ours
-    killed: bool = False  # by us, because it did not end when asked
+    asked: bool = False  # we sent it a signal to end
+    killed: bool = False  # we killed it, because it did not end when asked
 
     @property
     def name(self) -> str:
-        """What people call it."""
+        """Its name for people."""
         return self.command.name
 
     @property
@@ -198,16 +197,16 @@ class Node:
 
     @property
     def code(self) -> int | None:
-        """Exit code (negative: the signal that ended it), None while it runs."""
+        """Exit code (negative: the signal that ended it); None while it runs."""
         return self.process.poll()
 
     @property
     def unasked_failure(self) -> bool:
-        """Whether it ended with an error, and not because it was asked to."""
+        """Whether it ended with an error without being asked to end."""
         return self.code not in (None, 0) and not self.asked
 
     def how_it_ended(self) -> str:
-        """For people."""
+        """How it ended, for people."""
         code = self.code
         if code is None:
             return f'{self.name} is running'
@@ -221,12 +220,12 @@ class Node:
     def interrupt(self) -> None:
         """Ask it to end."""
         self.asked = True
-        if self.code is None:  # not yet waited for, so its number cannot be anybody else's by now
+        if self.code is None:  # not waited for yet, so no other process can have its id
             os.kill(self.process.pid, signal.SIGINT)
 
 
 def end_of_log(path: Path, lines: int = 15) -> str:
-    """The last lines of a log, for people; empty where there are none."""
+    """The last lines of a log, for people; empty if there are none."""
     try:
         with path.open('rb') as file:
             file.seek(0, os.SEEK_END)
@@ -239,12 +238,12 @@ def end_of_log(path: Path, lines: int = 15) -> str:
 
 @dataclass
 class Processes:
-    """All processes of a run. A context manager: on leaving it, none is left.
+    """All processes of a run. A context manager: on leaving it, no process is left.
 
     Attributes:
         say: tells people what is being done about a process that does not end.
-        hurry: whether the user has asked again; deadlines are short then.
-        start_program: starts each of them.
+        hurry: whether the user has asked again; deadlines are then short.
+        start_program: starts each process.
     """
 
     say: Callable[[str], None]
@@ -272,24 +271,24 @@ class Processes:
             self.nodes.append(Node(command, process, log))
 
     def running(self) -> list[Node]:
-        """Those that have not ended."""
+        """The processes that have not ended."""
         return [node for node in self.nodes if node.code is None]
 
     def failed(self) -> Node | None:
-        """The first that ended with an error and was not told to end."""
+        """The first that ended with an error without being asked to end."""
         return next((node for node in self.nodes if node.unasked_failure), None)
 
     def stop(self) -> None:
-        """Ask all that run to end: first the loop, then the recorder, that it may miss nothing."""
+        """Ask all that run to end, the recorder last so that it misses nothing."""
         self._end([node for node in self.running() if node.role != 'record'])
         self._end(self.running())
 
     def kill(self, nodes: Sequence[Node]) -> None:
-        """End processes, and all that they have started, at once."""
+        """End processes at once, with all that they have started."""
         for node in nodes:
             if node.code is None:
                 node.killed = node.asked = True
-                # Not yet waited for, so its number cannot be anybody else's by now.
+                # Not waited for yet, so no other process can have its id.
                 os.killpg(node.process.pid, signal.SIGKILL)
                 node.process.wait()
 

@@ -1,9 +1,9 @@
-"""How processes of a run set up the middleware unless the user says otherwise."""
+"""The middleware settings of the processes of a run, unless the user sets others."""
 
 DEFAULTS: dict[str, str] = {
-    # Only this host is looked at unless the user asks for more.
+    # Discover nodes on this host only, unless the user asks for more.
     'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-    # Asynchronous publication adds a thread and a copy, and orders nothing better.
+    # Asynchronous publication adds a thread and a copy, and no better order.
     'RMW_FASTRTPS_PUBLICATION_MODE': 'SYNCHRONOUS',
 }
-"""Environment variables; those that are set stay as they are."""
+"""Environment variables; those already set keep their values."""

@@ -1,4 +1,4 @@
-"""Watching the processes of a run until it is over, however it ends."""
+"""Watches the processes of a run until it is over, however it ends."""
 
 import signal
 import time
@@ -13,16 +13,15 @@ from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import reports
 
 SILENCE_DEADLINE = 90.0
-"""Seconds of silence that the last nodes may take to end after the others."""
+"""Seconds of silence after which the last nodes must have ended too."""
 
 
 class Interrupts:
-    """Counts how often the user has asked to stop (SIGINT, SIGTERM), instead of dying of it.
+    """Counts the user's requests to stop (SIGINT, SIGTERM), which then do not end the process.
 
     Attributes:
-        count: how often.
-        raising: raise KeyboardInterrupt from the second on, for code that does not look here
-            often.
+        count: how many there were.
+        raising: raise KeyboardInterrupt from the second on, for code that rarely checks `count`.
     """
 
     def __init__(self) -> None:
@@ -55,24 +54,24 @@ class Interrupts:
 
 
 class Silence:
-    """How long nothing was heard of a run. Presence does not count: nodes that hang say it."""
+    """The time since the last record of a run. Presence does not count: hung nodes publish it."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._last = clock()
 
     def receive(self, record: Record) -> None:
-        """Take note of a record."""
+        """Note a record."""
         if not isinstance(record, Presence):
             self.broken()
 
     def broken(self) -> None:
-        """Something was heard."""
+        """Begin anew: something has happened."""
         self._last = self._clock()
 
     @property
     def seconds(self) -> float:
-        """Since something was last heard."""
+        """Seconds since something last happened."""
         return self._clock() - self._last
 
 
@@ -84,16 +83,16 @@ def supervise(
     gave_up: Callable[[Node], str | None] = lambda node: None,
     deadline: float = SILENCE_DEADLINE,
 ) -> str | None:
-    """Watch until every process has ended; end them when one fails or the user asks.
+    """Watch until every process has ended; end them all if one fails or the user asks.
 
     Args:
-        processes: those of the run, started.
-        poll: hands on what arrived and waits a moment for more.
-        interrupts: whether the user has asked to stop.
-        silence: fed by `poll`.
-        gave_up: of a node that ended well: why it did so before the run was over, or
+        processes: the processes of the run, started.
+        poll: hands on what arrived, and waits a moment for more.
+        interrupts: counts the user's requests to stop.
+        silence: the time since the last record; `poll` feeds it.
+        gave_up: for a node with exit code 0: returns why it ended before the run was over, or
             None.
-        deadline: seconds of silence after which nodes that have not ended with the others are
+        deadline: seconds of silence after which nodes that did not end with the others are
             ended.
 
     Returns:
@@ -132,15 +131,15 @@ def _stop_all(processes: Processes, reason: str) -> str:
 
 
 def _after_stop(processes: Processes) -> str | None:
-    """An interrupted run has failed only where a node did not end as it should."""
-    # SIGINT itself ends a process that has not yet come so far as to handle it.
+    """An interrupted run has failed only if a node ended in any other way than it should."""
+    # SIGINT itself ends a process that does not handle it yet.
     clean = (0, -signal.SIGINT)
     odd = [node.how_it_ended() for node in processes.nodes if node.code not in clean]
     return '; '.join(odd) or None
 
 
 def why_it_gave_up(node: Node, folder: Path) -> str | None:
-    """Read from a node's report whether it ended before its run was over."""
+    """Why a node ended before its run was over, from its report; None if it did not."""
     path = run_folder.report_path(folder, node.role, node.name)
     if not path.is_file():
         return f'{node.name} ended without a report'

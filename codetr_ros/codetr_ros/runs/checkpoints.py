@@ -1,11 +1,11 @@
-"""Checkpoints: a folder of two files, written whole or not at all, hashed, without pickle.
+"""Checkpoints: folders of two files, written whole or not at all, hashed, without pickle.
 
     <folder>/<name>-<phase>/tensors.safetensors    weights, optimiser moments, labels: all tensors
     <folder>/<name>-<phase>/checkpoint.json        everything else, with the sha256 of both files
 
-A checkpoint is written under a hidden temporary name, synced and renamed; only then are older ones
-removed. So there is always a whole one to return to. What is missing or damaged is refused, never
-silently replaced by a fresh start.
+A checkpoint is written under a hidden temporary name, synced and renamed. Only then are older ones
+removed, so there is always a whole one to return to. A missing or damaged checkpoint is refused,
+never silently replaced by a fresh start.
 """
 
 import hashlib
@@ -27,11 +27,13 @@ from codetr_ros.system.files import sync_folder, write_synced
 TENSORS = 'tensors.safetensors'
 DESCRIPTION = 'checkpoint.json'
 FORMAT = 1
-"""Raised whenever the layout of a checkpoint changes its meaning."""
+"""Increased whenever the layout of a checkpoint changes its meaning."""
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that cannot be written or must not be read: names file, hashes and remedy."""
+    """A checkpoint that cannot be written or must not be read: the message names file, hashes and
+    remedy.
+    """
 
 
 def digest(tensors: Mapping[str, torch.Tensor]) -> str:
@@ -39,16 +41,15 @@ def digest(tensors: Mapping[str, torch.Tensor]) -> str:
     total = hashlib.sha256()
     for name in sorted(tensors):
         tensor = tensors[name].detach().cpu().contiguous()
-        # A JSON line before the bytes, so that neither names nor shapes can run into each other or
-        # into the values.
+        # A JSON line before the bytes keeps names, shapes and values apart.
         total.update(json.dumps([name, str(tensor.dtype), list(tensor.shape)]).encode() + b'\n')
         total.update(_bytes(tensor))
     return total.hexdigest()
 
 
 def _bytes(tensor: torch.Tensor) -> bytes:
-    # Through uint8: numpy has no bfloat16. The reshape before it is because a 0-dimensional tensor
-    # has no byte view.
+    # Through uint8, since numpy has no bfloat16. Reshaped, since a 0-dimensional tensor has no
+    # byte view.
     flat = tensor.reshape(-1).view(torch.uint8).numpy()
     return bytes(np.ascontiguousarray(flat).data)
 
@@ -64,20 +65,19 @@ def save(
     """Write a checkpoint, then remove all but the newest `keep` of this name.
 
     Args:
-        folder: where checkpoints lie; made if it is missing.
-        name: whose checkpoint it is: letters, digits, `_`, `.`, `-`.
-        phase: after which phase of the run; one that exists for it is replaced.
-        tensors: all state that is tensors, on any device.
-        meta: all state that is not: JSON-able, numbers finite.
-        keep: how many to keep, at least 1.
+        folder: the folder of the checkpoints; made if it is missing.
+        name: the name of its owner: letters, digits, `_`, `.`, `-`.
+        phase: the last phase before it; an existing checkpoint of this phase is replaced.
+        tensors: the state that consists of tensors, on any device.
+        meta: all other state: JSON-able, numbers finite.
+        keep: how many checkpoints to keep, at least 1.
 
     Returns:
         The checkpoint's folder.
 
     Raises:
-        CheckpointError: a name, phase, `keep` or `meta` that cannot be written; nothing has
-            changed then.
-        OSError: disk full or not writable; the older checkpoints are untouched then.
+        CheckpointError: the name, phase, `keep` or `meta` is refused; nothing has changed then.
+        OSError: the disk is full or not writable; the older checkpoints are untouched then.
     """
     if not re.fullmatch(r'[A-Za-z0-9_][A-Za-z0-9_.-]*', name):
         raise CheckpointError(f'checkpoint name {name!r}: use letters, digits, "_", "." and "-"')
@@ -115,7 +115,7 @@ def save(
     write_synced(partial / DESCRIPTION, description)
     sync_folder(partial)
     if path.exists():
-        # A folder that is not empty cannot be renamed over. The name counts as partial: if the
+        # A rename cannot replace a folder that is not empty. The name counts as partial: if the
         # machine stops between the two renames, the next older checkpoint is the latest.
         os.replace(path, folder / f'.{name}-{phase:06d}.replaced.partial')
     os.replace(partial, path)
@@ -128,14 +128,14 @@ def save(
 
 
 def load(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Read a checkpoint after verifying the sha256 of both of its files.
+    """Verify the sha256 of both files of a checkpoint and read it.
 
     Returns:
         The tensors (on the CPU, in memory of their own) and the `meta` that were saved.
 
     Raises:
-        CheckpointError: a file is missing or damaged, or of another format: names it, both hashes
-            and the remedy.
+        CheckpointError: a file is missing, damaged or of another format; names the file, both
+            hashes and the remedy.
     """
     remedy = f'remove {path} to continue from an older checkpoint, or restore it from a copy'
     content = {}
@@ -149,35 +149,35 @@ def load(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
 
     try:
         description = json.loads(content[DESCRIPTION])
-        said = description.pop('sha256')
-        found = hashlib.sha256(_canonical(description)).hexdigest()
+        stored = description.pop('sha256')
+        actual = hashlib.sha256(_canonical(description)).hexdigest()
     except (ValueError, TypeError, AttributeError, KeyError) as error:
-        found = hashlib.sha256(content[DESCRIPTION]).hexdigest()
+        actual = hashlib.sha256(content[DESCRIPTION]).hexdigest()
         raise CheckpointError(
             f'checkpoint file {path / DESCRIPTION} is damaged: not a description with its sha256 '
-            f'({type(error).__name__}: {error}; the file has sha256 {found}): {remedy}'
+            f'({type(error).__name__}: {error}; the file has sha256 {actual}): {remedy}'
         ) from None
-    if said != found:
-        raise CheckpointError(_damaged(path / DESCRIPTION, found, said, remedy))
+    if stored != actual:
+        raise CheckpointError(_damaged(path / DESCRIPTION, actual, stored, remedy))
     if description.get('format') != FORMAT:
         raise CheckpointError(
             f'checkpoint {path} has format {description.get("format")!r}, but this version reads '
             f'{FORMAT}: read it with the version that wrote it'
         )
-    found, said = hashlib.sha256(content[TENSORS]).hexdigest(), description['tensors_sha256']
-    if said != found:
-        raise CheckpointError(_damaged(path / TENSORS, found, said, remedy))
+    actual, stored = hashlib.sha256(content[TENSORS]).hexdigest(), description['tensors_sha256']
+    if stored != actual:
+        raise CheckpointError(_damaged(path / TENSORS, actual, stored, remedy))
     return safetensors.torch.load(content[TENSORS]), description['meta']
 
 
 def latest(folder: Path, name: str) -> Path | None:
     """The whole checkpoint of this name with the highest phase, or None; `load` verifies it."""
-    found = _all(folder, name)
-    return found[-1] if found else None
+    checkpoints = _all(folder, name)
+    return checkpoints[-1] if checkpoints else None
 
 
-def _damaged(file: Path, found: str, said: str, remedy: str) -> str:
-    return f'checkpoint file {file} is damaged: sha256 is {found}, should be {said}: {remedy}'
+def _damaged(file: Path, actual: str, stored: str, remedy: str) -> str:
+    return f'checkpoint file {file} is damaged: sha256 is {actual}, should be {stored}: {remedy}'
 
 
 def phase_of(path: Path) -> int:
@@ -194,7 +194,7 @@ def _all(folder: Path, name: str) -> list[Path]:
 
 
 def _remove_partial(folder: Path, name: str) -> None:
-    """Remove what a process that was killed while saving left behind."""
+    """Remove what a process left behind that was killed during a save."""
     pattern = re.compile(r'\.' + re.escape(name) + r'-\d{6,}(\.replaced)?\.partial')
     for path in folder.iterdir():
         if pattern.fullmatch(path.name):

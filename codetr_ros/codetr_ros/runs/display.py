@@ -1,4 +1,4 @@
-"""What is shown while something runs: in place on a terminal, else plain lines."""
+"""Shows the progress of something that runs: in place on a terminal, else in plain lines."""
 
 import sys
 import time
@@ -13,15 +13,15 @@ from rich.text import Text
 
 
 class Display(ABC):
-    """Shows how something is doing, while used as a context.
+    """Shows the progress of something. A context manager.
 
     Args:
         stream: where to show it.
-        live: change the display in place; by default if `stream` is a terminal.
+        live: change the display in place; None: if `stream` is a terminal.
         clock: seconds, never going back.
     """
 
-    plain_every: ClassVar[float]  # seconds between plain lines that nothing else asks for
+    plain_every: ClassVar[float]  # seconds between regular plain lines
     live_every: ClassVar[float]  # seconds between changes of the display
 
     def __init__(
@@ -33,7 +33,7 @@ class Display(ABC):
         self._stream = stream or sys.stdout
         self._console = Console(file=self._stream)
         wanted = self._console.is_terminal if live is None else live
-        # No thread of its own: what arrives and the display would have to be kept from each other.
+        # No thread of its own, which would have to be synchronised with arriving records.
         self._live = Live(console=self._console, auto_refresh=False) if wanted else None
         self._clock = clock
         self._began = self._shown = clock()
@@ -59,7 +59,7 @@ class Display(ABC):
         self._stream.flush()
 
     def tick(self) -> None:
-        """Show how things are, if it is time; to be called now and then while nothing arrives."""
+        """Show the progress if it is due. Call it now and then while nothing arrives."""
         now = self._clock()
         if now - self._shown < (self.plain_every if self._live is None else self.live_every):
             return
@@ -71,8 +71,8 @@ class Display(ABC):
 
     @abstractmethod
     def _plain(self) -> None:
-        """Say how things are in a line."""
+        """Show the progress in a line."""
 
     @abstractmethod
     def _render(self) -> RenderableType:
-        """How things are, for the display in place."""
+        """The progress, for the display in place."""

@@ -1,7 +1,7 @@
 """A document of headings, paragraphs, lists, tables and pictures, as Markdown and as HTML.
 
-Every report is made of these blocks: that of a run, of a fit and of a benchmark. An HTML page
-needs no network and, where its pictures are given as bytes, no other file.
+The reports of a run, a fit and a benchmark are all made of these blocks. An HTML page needs no
+network and, if its pictures are given as bytes, no other file.
 """
 
 import base64
@@ -83,7 +83,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG: a file beside the document, or its bytes, which the HTML page then holds itself."""
+    """A PNG: the name of a file beside the document, or bytes that the HTML page holds itself."""
 
     source: str | bytes
     alt: str
@@ -91,7 +91,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Verbatim:
-    """What a program printed."""
+    """The output of a program."""
 
     text: str
 
@@ -100,7 +100,7 @@ Block = Heading | Paragraph | Items | Table | Facts | Picture | Verbatim
 
 
 def cell(value: Any) -> str:
-    """A value for people: numbers with six digits, sequences with commas, None as nothing."""
+    """A value for people: numbers with six digits, sequences with commas, None as empty text."""
     if value is None:
         return ''
     if isinstance(value, float):
@@ -117,7 +117,7 @@ def facts(rows: Sequence[Sequence[Any]] | Mapping[str, Any]) -> Facts:
 
 
 def records(rows: Sequence[Mapping[str, Any]]) -> Block:
-    """A table of rows that have the same names; a word where there is no row."""
+    """A table of rows that have the same names; the word `none` if there is no row."""
     if not rows:
         return Paragraph('none')
     names = list(rows[0])

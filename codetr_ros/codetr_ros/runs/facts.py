@@ -1,4 +1,4 @@
-"""What a run writes about itself: fields with descriptions, whose types are checked on reading."""
+"""The facts that a run writes about itself: fields with descriptions, checked on reading."""
 
 import json
 import math
@@ -26,14 +26,14 @@ Number = Annotated[float | None, BeforeValidator(finite)]
 """A finite number; None where it is not known, not defined or not finite."""
 
 Counts = dict[str, int]
-"""How many of each: of messages by topic, or of whatever has the name."""
+"""Counts by name: of messages by topic, or of anything else."""
 
 
 class Facts(BaseModel):
-    """Base of what is written: immutable, every number finite.
+    """Base of the facts: immutable, every number finite.
 
-    A field that is not known here is passed over: a later version of the program may have written
-    it. A field that is lacking is refused, unless it has a default.
+    An unknown field is ignored, because a later version of the program may have written it. A
+    missing field is refused unless it has a default.
     """
 
     model_config = ConfigDict(extra='ignore', frozen=True, allow_inf_nan=False)
@@ -43,16 +43,16 @@ _F = TypeVar('_F', bound=Facts)
 
 
 def read(kind: type[_F], path: Path, what: str, remedy: str) -> _F:
-    """Read what a run has written into a file.
+    """Read the facts that a run has written into a file.
 
     Args:
-        kind: what it holds.
+        kind: the kind of facts.
         path: the file.
-        what: a name for it, for the error.
-        remedy: what to do where it is refused, for the error.
+        what: a name for the file, for the error.
+        remedy: what to do if it is refused, for the error.
 
     Raises:
-        RunFolderError: it cannot be read, is not a JSON object, or lacks a field or has one of
+        RunFolderError: it cannot be read, is not a JSON object, lacks a field or has one of
             another type; names the file and the field.
     """
     try:
@@ -76,7 +76,7 @@ class Described:
     """A field, for people.
 
     Attributes:
-        name: as it is reached: `messages.*.lost` is `lost` of each entry of `messages`,
+        name: its path: `messages.*.lost` is `lost` of each entry of `messages`,
             `evaluations[].step` is `step` of each row of `evaluations`.
         description: what it is, with its unit.
     """
@@ -86,7 +86,7 @@ class Described:
 
 
 def described(kind: type[Facts], prefix: str = '') -> Iterator[Described]:
-    """All fields, those of rows and entries after the field that holds them."""
+    """All fields; those of rows and entries follow the field that holds them."""
     for name, field in kind.model_fields.items():
         yield Described(name=prefix + name, description=field.description or '')
         inner, place = _inner(field.annotation)
@@ -95,7 +95,7 @@ def described(kind: type[Facts], prefix: str = '') -> Iterator[Described]:
 
 
 def _inner(annotation: Any) -> tuple[type[Facts] | None, str]:
-    """The facts that a field holds one or many of, and how one of them is reached."""
+    """The kind of facts that a field holds, one or many, and the path to one of them."""
     if isinstance(annotation, type) and issubclass(annotation, Facts):
         return annotation, ''
     origin = getattr(annotation, '__origin__', None)

@@ -1,4 +1,4 @@
-"""The folder of a run: what lies where in it."""
+"""The folder of a run and the places in it."""
 
 import os
 import re
@@ -21,11 +21,11 @@ PICTURE = 'learning_curve.png'
 
 
 class RunFolderError(ValueError):
-    """A folder that cannot hold a run, or that does not hold one: names it and says what to do."""
+    """A folder that cannot hold a run, or holds none: the message names it and the remedy."""
 
 
 def check(path: Path) -> None:
-    """Say whether `create` would accept this folder, without making anything.
+    """Check that `create` would accept this folder, without making anything.
 
     Raises:
         RunFolderError: it exists and is not empty, is not a folder, or cannot be written.
@@ -35,14 +35,14 @@ def check(path: Path) -> None:
             raise RunFolderError(f'output folder {path} is a file: choose another with --out')
         if not os.access(path, os.W_OK | os.X_OK):
             raise RunFolderError(
-                f'output folder {path} cannot be written: change its permissions '
-                'or choose another with --out'
+                f'output folder {path} cannot be written: change its permissions or choose '
+                'another with --out'
             )
-        if found := sorted(entry.name for entry in path.iterdir()):
-            shown = ', '.join(found[:3]) + (', ...' if len(found) > 3 else '')
+        if names := sorted(entry.name for entry in path.iterdir()):
+            shown = ', '.join(names[:3]) + (', ...' if len(names) > 3 else '')
             raise RunFolderError(
-                f'output folder {path} exists and is not empty ({shown}): '
-                'choose another with --out, or remove it'
+                f'output folder {path} exists and is not empty ({shown}): choose another with '
+                '--out, or remove it'
             )
         return
     parent = path.absolute().parent
@@ -50,13 +50,13 @@ def check(path: Path) -> None:
         parent = parent.parent
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
         raise RunFolderError(
-            f'output folder {path} cannot be made, {parent} cannot be written: '
-            'change its permissions or choose another with --out'
+            f'output folder {path} cannot be made, {parent} cannot be written: change its '
+            'permissions or choose another with --out'
         )
 
 
 def create(path: Path) -> Path:
-    """Make the folder of a new run, with the folders in it that every run has.
+    """Make the folder of a new run, with the folders that every run has.
 
     Returns:
         The absolute path.
@@ -77,13 +77,13 @@ def create(path: Path) -> Path:
 
 
 def bag_of(path: Path) -> Path:
-    """The bag in a run's folder; any other path as it is."""
+    """The bag in a run's folder; any other path unchanged."""
     inside = path / BAG
     return inside if (path / CONFIG).is_file() and inside.is_dir() else path
 
 
 def write_settings(folder: Path, settings: config.Settings) -> Path:
-    """Write every setting to the run's `config.yaml`, from which `config.load` reads them."""
+    """Write every setting to the run's `config.yaml`; `config.load` reads it."""
     path = folder / CONFIG
     text = yaml.safe_dump(settings.model_dump(mode='json'), sort_keys=False)
     note = f'# Every setting of this run: `codetr train --config {CONFIG}` repeats it.'
@@ -96,13 +96,13 @@ def read_settings(folder: Path) -> config.Settings:
 
     Raises:
         RunFolderError: there is no `config.yaml`, so this is not the folder of a run.
-        SettingsError: it holds settings that are refused.
+        SettingsError: its settings are refused.
     """
     path = folder / CONFIG
     if not path.is_file():
         raise RunFolderError(
-            f'{folder} is not the folder of a run, it has no {CONFIG}: '
-            'give the folder that `codetr train` named'
+            f'{folder} is not the folder of a run, it has no {CONFIG}: give the folder that '
+            '`codetr train` named'
         )
     return config.load(str(path))
 
@@ -112,5 +112,5 @@ def _file_name(text: str) -> str:
 
 
 def report_path(folder: Path, role: str, name: str) -> Path:
-    """Where the node of this role and (fully qualified or plain) name leaves its report."""
+    """The path of the report of a node with this role and (fully qualified or plain) name."""
     return folder / NODES / f'{role}-{_file_name(name.rsplit("/", 1)[-1])}.json'

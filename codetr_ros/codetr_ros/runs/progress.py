@@ -1,6 +1,6 @@
 """Live progress of a run: a display that changes in place on a terminal, else plain lines.
 
-It is fed with the run's records, whoever carries them; it knows nothing of ROS.
+It takes the run's records, from topics or in process, and knows nothing of ROS.
 """
 
 import time
@@ -32,12 +32,12 @@ def duration(seconds: float) -> str:
 
 
 class Progress(Display):
-    """Shows how a run is doing.
+    """Shows the progress of a run.
 
     Args:
         settings: the run's settings.
         stream: where to show it.
-        live: change the display in place; by default if `stream` is a terminal.
+        live: change the display in place; None: if `stream` is a terminal.
         clock: seconds, never going back.
     """
 
@@ -69,7 +69,7 @@ class Progress(Display):
         return self
 
     def receive(self, record: Record) -> None:
-        """Take note of a record of the run."""
+        """Note a record of the run."""
         if isinstance(record, Commit):
             if record.phase >= self._phase:
                 self._phase = record.phase + 1
@@ -104,18 +104,18 @@ class Progress(Display):
 
     @property
     def lost(self) -> int:
-        """Messages that nodes know were published to them and that never reached them."""
+        """Messages that were published and, by the nodes' counts, never reached them."""
         return sum(self._missed.values())
 
     @property
     def rate(self) -> float:
-        """Environment steps per second over the last phases; 0 while there is none."""
+        """Environment steps per second over the last phases; 0 before the first."""
         (then, before), (now, steps) = self._marks[0], self._marks[-1]
         return (steps - before) / (now - then) if now > then else 0.0
 
     @property
     def seconds_left(self) -> float | None:
-        """Estimate from the present speed; None while there is none."""
+        """An estimate from the present speed; None before the first phase."""
         return (self._settings.steps - self.steps) / self.rate if self.rate else None
 
     @staticmethod
@@ -154,10 +154,11 @@ class Progress(Display):
             bad = name == 'lost messages' and self.lost > 0
             table.add_row(Text(name, style='dim'), Text(text, style='bold red' if bad else ''))
         nodes = ', '.join(sorted(node.rsplit('/', 1)[-1] for node in self._present))
-        said = [f'{self._note}...' if self._note else '', f'nodes: {nodes}' if nodes else '']
+        notes = [f'{self._note}...'] if self._note else []
+        notes += [f'nodes: {nodes}'] if nodes else []
         whole = Table.grid()
-        if any(said):
-            whole.add_row(Text('  '.join(text for text in said if text), style='dim'))
+        if notes:
+            whole.add_row(Text('  '.join(notes), style='dim'))
         whole.add_row(ProgressBar(total=self._settings.steps, completed=self.steps, width=60))
         whole.add_row(table)
         return whole

@@ -1,7 +1,7 @@
-"""Reward recovery over a run: do the labels of the day agree with the true step rewards?
+"""Reward recovery over a run: do the current labels agree with the true step rewards?
 
-An observer, of a run in process while it goes on, of a run over topics by its bag. Nothing comes
-back from it: neither learner nor reward model can see what it sees.
+This observer follows a run in process while it goes on, and reads a run over topics from its bag.
+Nothing flows back: neither learner nor reward model can see what it sees.
 
 What is measured: docs/methods.md#reward-recovery.
 """
@@ -13,7 +13,7 @@ from codetr_ros.records import F32, I64, Record, StepRewards, TrueRewards
 
 
 class RecoveryError(ValueError):
-    """Labels that cannot be compared: some of the true rewards are not there; says whose."""
+    """Labels that cannot be compared, for want of true rewards: the message names their source."""
 
 
 class _Source:
@@ -31,10 +31,10 @@ class _Source:
         self._end = 0
 
     def append(self, record: TrueRewards) -> None:
-        """Steps that follow on those before.
+        """Append the steps that follow those before.
 
         Raises:
-            RecoveryError: they do not.
+            RecoveryError: they do not follow them.
         """
         due = (self._episode, self._steps) if record.first_step else (self._episode + 1, 0)
         if (record.episode, record.first_step) != due:
@@ -55,12 +55,12 @@ class _Source:
         self._labels[slots] = np.nan
 
     def label(self, record: StepRewards) -> None:
-        """Labels of segments; those of steps that are no longer held are left out.
+        """Take labels of segments; those of steps that are no longer held are left out.
 
-        Steps are labelled with their whole segment the first time, and maybe some of them later.
+        The first labels of a step come with its whole segment; later ones may come alone.
 
         Raises:
-            RecoveryError: for steps without true rewards.
+            RecoveryError: labels belong to steps without true rewards.
         """
         lengths = record.lengths.astype(np.int64)
         last = np.lexsort((record.first_steps, record.episodes))[-1]
@@ -82,8 +82,8 @@ class _Source:
         self._versions[slots] = record.version
 
     def labelled(self, version: int | None) -> tuple[F32, F32, I64]:
-        """Labels, true rewards and segments (T,) of the steps that have a label, of this version
-        if one is given.
+        """Labels, true rewards and segments (T,) of the labelled steps; if a version is given, only
+        of those that it labelled.
         """
         held = slice(min(self._end, self._capacity))
         there = ~np.isnan(self._labels[held])
@@ -95,16 +95,16 @@ class _Source:
 class Recovery:
     """Compares labels and true rewards whenever a policy is due for evaluation.
 
-    What is compared is what the policy learns from: labels of the newest `memory_steps` steps up
-    to the phase of the labels; where all of the memory is labelled again in each phase, those of
-    the newest version only, as others belong to steps that have left it. They take 20 bytes each.
-    True rewards may come before labels of earlier phases: as many phases as the run's simulators
-    may be ahead of its learner, or any number where they are recorded.
+    It compares the labels that the policy learns from: those of the newest `memory_steps` steps up
+    to the phase of the labels. If each phase labels all of the memory again, only the newest
+    version counts, since other labels belong to steps that have left the memory. A step takes 20
+    bytes. True rewards may come before labels of earlier phases: by as many phases as the run's
+    simulators may be ahead of its learner, or by any number in a bag.
 
     Args:
         settings: the run's settings.
-        recorded: the labels are those of the run's bag, which may lack some (`record_relabels`).
-            What lacks labels is not compared.
+        recorded: the labels come from the run's bag, which may lack some (`record_relabels`).
+            Evaluations without all labels are not compared.
     """
 
     def __init__(self, settings: Settings, recorded: bool = False) -> None:
@@ -115,19 +115,19 @@ class Recovery:
         self._sources: dict[str, _Source] = {}
         self._coming: list[TrueRewards] = []  # of phases that are not labelled yet
         self.rows: list[dict[str, float]] = []
-        """For each evaluation with labels: `step`, `pearson`, `within` (Pearson after each
-        segment's mean was taken from both), `spearman` (NaN where one side does not vary), and
-        `steps`, how many were compared."""
+        """For each evaluation with labels: `step`, `pearson`, `within` (Pearson after subtracting
+        each segment's mean from both), `spearman` (NaN if one side does not vary), and `steps`,
+        the number of compared steps."""
 
     def receive(self, record: Record) -> None:
-        """Take note of a record of the run, of whatever kind.
+        """Note a record of the run, of any kind.
 
         Raises:
-            RecoveryError: there are labels, but not all of the true rewards.
+            RecoveryError: there are labels, but some true rewards are missing.
         """
         if isinstance(record, TrueRewards):
             if not self._recorded:
-                # those are labelled, if ever: of a run without labels none may wait for good
+                # labelled by now, if ever: in a run without labels they must not pile up
                 self._take_in(record.phase - self._settings.lag)
             self._coming.append(record)
         elif isinstance(record, StepRewards):
@@ -141,8 +141,8 @@ class Recovery:
                 self._compare(self._settings.steps_after(record.phase), record.version)
 
     def _note_version(self, record: StepRewards) -> None:
-        """Another version labels again what has a label: a bag has that of evaluations only. What
-        has none yet it has in any case.
+        """A new version labels steps again. A bag has these labels only at evaluations, but it
+        always has the first label of a step.
         """
         if record.version != self._version and self._version is not None:
             whole = self._settings.evaluated(record.phase) and self._settings.relabels_all
@@ -150,9 +150,9 @@ class Recovery:
         self._version = record.version
 
     def _take_in(self, phase: int) -> None:
-        """True rewards of the phases up to this one."""
-        come, self._coming = self._coming, []
-        for record in come:
+        """Take in the true rewards of the phases up to this one."""
+        waiting, self._coming = self._coming, []
+        for record in waiting:
             if record.phase > phase:
                 self._coming.append(record)
                 continue
@@ -164,24 +164,23 @@ class Recovery:
     def _compare(self, step: int, version: int) -> None:
         if not self._complete:
             return
-        from codetr_ros.runs.recovery_metrics import (
-            flat_recovery,  # scipy takes a second to import
-        )
+        # here, because scipy takes a second to import
+        from codetr_ros.runs.recovery_metrics import flat_recovery
 
         only = version if self._settings.relabels_all else None
-        found = [source.labelled(only) for _, source in sorted(self._sources.items())]
-        # the segments of several sources must not share a number
+        columns = [source.labelled(only) for _, source in sorted(self._sources.items())]
+        # segments of different sources must not share a number
         far = np.int64(1) << 40
-        labels, true = (np.concatenate([each[i] for each in found]) for i in (0, 1))
-        segments = np.concatenate([each[2] + i * far for i, each in enumerate(found)])
+        labels, true = (np.concatenate([each[i] for each in columns]) for i in (0, 1))
+        segments = np.concatenate([each[2] + i * far for i, each in enumerate(columns)])
         if len(labels):
-            said = flat_recovery(labels, true, segments)
+            correlations = flat_recovery(labels, true, segments)
             self.rows.append(
                 {
                     'step': step,
-                    'pearson': said['pearson'],
-                    'within': said['within_pearson'],
-                    'spearman': said['spearman'],
+                    'pearson': correlations['pearson'],
+                    'within': correlations['within_pearson'],
+                    'spearman': correlations['spearman'],
                     'steps': len(labels),
                 }
             )

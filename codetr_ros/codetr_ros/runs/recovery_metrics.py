@@ -1,6 +1,6 @@
 """How well inferred step rewards agree with the true ones, and predictions with scores.
 
-A correlation, or R^2, is NaN where one side does not vary: there is nothing to explain then.
+A correlation or R^2 is NaN if one side does not vary: there is nothing to explain then.
 """
 
 import numpy as np
@@ -26,11 +26,11 @@ def step_recovery(
     Args:
         labels: inferred step rewards (B, L).
         true: the environment's own (B, L).
-        inside: which steps (B, L) are their segments' own: neither context nor padding.
+        inside: whether each step (B, L) is part of its segment: neither context nor padding.
 
     Returns:
-        `pearson` and `spearman` over all steps; `within_pearson` and `within_spearman` after each
-        segment's mean was taken from both: is credit right inside the segment?
+        `pearson` and `spearman` over all steps; `within_pearson` and `within_spearman` after
+        subtracting each segment's mean from both: is credit right inside the segment?
     """
     segments = np.broadcast_to(np.arange(len(inside))[:, None], inside.shape)
     return flat_recovery(np.asarray(labels)[inside], np.asarray(true)[inside], segments[inside])
@@ -39,16 +39,17 @@ def step_recovery(
 def flat_recovery(
     labels: ArrayLike, true: ArrayLike, segments: NDArray[np.int64]
 ) -> dict[str, float]:
-    """The same of steps (T,) in a row; `segments` (T,) numbers the segment of each."""
+    """The same for steps in a row (T,); `segments` (T,) numbers the segment of each."""
     pair = [np.asarray(x, np.float64) for x in (labels, true)]
     _, which = np.unique(segments, return_inverse=True)
     n = np.bincount(which)
     centred = [x - (np.bincount(which, x) / n)[which] for x in pair]
-    # what rounding leaves of a constant from which its mean was taken is no variation
+    # the rounding error of a constant less its mean is no variation
     least = [1e-9 * float(np.abs(x).max(initial=0)) for x in pair]
-    found = {}
+    correlations = {}
     for prefix, (a, b) in (('', pair), ('within_', centred)):
         varies = len(a) > 1 and np.ptp(a) > least[0] and np.ptp(b) > least[1]
         for name, measure in (('pearson', stats.pearsonr), ('spearman', stats.spearmanr)):
-            found[prefix + name] = float(measure(a, b).statistic) if varies else float('nan')
-    return found
+            value = float(measure(a, b).statistic) if varies else float('nan')
+            correlations[prefix + name] = value
+    return correlations

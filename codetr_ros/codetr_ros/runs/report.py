@@ -16,7 +16,7 @@ _TRUE, _SCORE = '#1f5fa8', '#b8561c'
 
 
 def title(summary: RunSummary) -> str:
-    """What run it was, in a line."""
+    """Names the run in a line."""
     s = summary
     what = f'{s.task}, {s.composite} of {s.delay} steps, {s.method}, seed {s.seed}'
     return what + (' (interrupted)' if s.interrupted else '')
@@ -25,10 +25,10 @@ def title(summary: RunSummary) -> str:
 def draw(summary: RunSummary) -> bytes:
     """The learning curve as a PNG: true return and score of each evaluation against steps.
 
-    The bands show the spread over an evaluation's episodes: from the worst to the best for the
-    true return, a standard deviation for the score. The dashed lines are the random policy.
+    The bands show the spread over an evaluation's episodes: worst to best for the true return, one
+    standard deviation for the score. The dashed lines are the random policy.
     """
-    # Without pyplot: no display, no state that outlives the picture, and half the import time.
+    # Without pyplot: no display, no state that outlives the picture, half the import time.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -116,7 +116,7 @@ def page(summary: RunSummary, picture: bytes) -> str:
 
 
 def result_rows(summary: RunSummary) -> list[tuple[str, str]]:
-    """The few numbers that people look for first, for the page and for the terminal."""
+    """The few numbers that people look for first, for the page and the terminal."""
 
     def number(value: float | None, form: str) -> str:
         return 'not evaluated' if value is None else format(value, form)
@@ -142,7 +142,7 @@ def result_rows(summary: RunSummary) -> list[tuple[str, str]]:
 
 
 def _recovery(summary: RunSummary) -> str:
-    """How well step rewards agreed with the true ones when they were last compared."""
+    """The agreement of step rewards with the true ones at the last comparison."""
     rows, evaluations = summary.reward_recovery, summary.evaluations
     if not rows:
         return 'no labels were compared'

@@ -1,7 +1,7 @@
-"""What each node of a run reports when it ends: `nodes/<role>-<name>.json`.
+"""The report that each node of a run writes when it ends: `nodes/<role>-<name>.json`.
 
-Only what is known is written: a simulator has no gradient steps, and on the way to a part of a run
-in one process nothing can be lost.
+Only known facts are written: a simulator has no gradient steps, and in a run in one process no
+record can be lost.
 """
 
 import json
@@ -19,7 +19,7 @@ from codetr_ros.system.files import atomic_write
 
 
 class MemoryFacts(Facts):
-    """What the memory D holds, and what it takes."""
+    """The contents of the memory D, and its size."""
 
     steps: int = Field(description='steps that it holds at the end')
     evicted: int = Field(description='steps that have left it since the start')
@@ -36,23 +36,23 @@ class StartedFrom(Facts):
 
 
 class FlushTimes(Facts):
-    """How long it took to get a phase of the bag onto the disk."""
+    """How long it took to flush a phase of the bag to the disk."""
 
     median: float = Field(description='median over the phases [ms]')
     max: float = Field(description='the longest [ms]')
 
 
 class _Wired(Facts):
-    """What whoever wires a core knows of it."""
+    """The facts that the wiring of a core knows."""
 
     role: str = Field(description='one of sim, evaluate, reward, learner, record')
     name: str = Field(description='name of the node')
     published: Counts = Field({}, description='records that it published, by topic')
     received: Counts = Field({}, description='records that reached it, by topic')
     refused: Counts = Field({}, description='records that it refused, by topic')
-    lost: Counts = Field({}, description='records that were published and never came, by topic')
+    lost: Counts = Field({}, description='records that were published and never arrived, by topic')
     fetched: Counts = Field(
-        {}, description='records that came only when they were asked for again, by topic'
+        {}, description='records that arrived only when fetched again, by topic'
     )
     peak_rss_mb: float | None = Field(
         None, description='most memory that its process had at once [MB]'
@@ -64,19 +64,19 @@ class _Wired(Facts):
         None, description='time from start to end; in process the time of its slices [s]'
     )
     finished: bool | None = Field(
-        None, description='whether all that the run asked of it was done; null if not known'
+        None, description='whether it did everything that the run asked of it; null if not known'
     )
     error: str | None = Field(None, description='why it gave up; null if it did not')
 
 
 class CoreReport(Facts):
-    """What a core reports, whoever wires it."""
+    """The facts that a core reports, over topics or in process."""
 
     refused: Counts = Field({}, description='records that it refused, by topic')
-    lost: Counts = Field({}, description='records that were published and never came, by topic')
-    duplicated: Counts = Field({}, description='records that came more than once, by topic')
-    counters: Counts = Field({}, description='what else was counted, in words')
-    memory: MemoryFacts | None = Field(None, description='what its memory D holds')
+    lost: Counts = Field({}, description='records that were published and never arrived, by topic')
+    duplicated: Counts = Field({}, description='records that arrived more than once, by topic')
+    counters: Counts = Field({}, description='other counts, by their names in words')
+    memory: MemoryFacts | None = Field(None, description='contents of its memory D')
     updates: int | None = Field(None, description='SAC updates taken')
     policy_sha256: str | None = Field(None, description="digest of the policy's weights")
     gradient_steps: int | None = Field(None, description='gradient steps of the reward model')
@@ -89,25 +89,23 @@ class CoreReport(Facts):
 
 
 class BagReport(Facts):
-    """What the recorder reports besides: what it has written, and how long the disk took."""
+    """The recorder's further facts: what it has written, and how long the disk took."""
 
     recorded: Counts = Field({}, description='records that it wrote into the bag, by topic')
     bag: str | None = Field(None, description='folder of the bag that it wrote')
     bag_bytes: int | None = Field(None, description='size of the bag [bytes]')
     flush_seconds: float | None = Field(
-        None, description='time that it took to get phases onto the disk, all together [s]'
+        None, description='time to flush all phases to the disk [s]'
     )
-    flush_ms: FlushTimes | None = Field(
-        None, description='time that it took to get a phase onto the disk'
-    )
+    flush_ms: FlushTimes | None = Field(None, description='time to flush a phase to the disk')
 
 
 class NodeReport(BagReport, CoreReport, _Wired):
-    """What a node, or a part of a run in one process, reports when it ends."""
+    """The report of a node, or of a part of a run in one process, at its end."""
 
     exit_code: int | None = Field(
         None,
-        description='exit code of its process: known to whoever started it, not in the file',
+        description='exit code of its process; not in the file, since its parent process adds it',
     )
 
 
@@ -127,21 +125,21 @@ def node_report(
     error: str | None,
     own: BagReport | None = None,
 ) -> NodeReport:
-    """The report of a node, whoever wires its core.
+    """The report of a node, or of a part of a run in one process.
 
     Args:
-        core: what its core reports.
+        core: the report of its core.
         role: one of `records.ROLES`.
         name: name of the node.
         published: records that it published, by topic.
         received: records that reached it, by topic.
-        refused: records that never came as far as the core, which adds those that it refused.
-        lost: records that never came, by topic; None without topics.
-        fetched: records that came when they were asked for again; None without topics.
+        refused: records refused before they reached the core, which adds its own refusals.
+        lost: records that never arrived, by topic; None in a run without topics.
+        fetched: records that arrived when fetched again; None in a run without topics.
         cpu_s: processor time [s].
         wall_s: time from start to end [s].
-        finished: whether all that the run asked of it was done.
-        error: why it gave up.
+        finished: whether it did everything that the run asked of it.
+        error: why it gave up; None if it did not.
         own: what the node itself adds.
     """
     given: dict[str, JsonValue] = {
@@ -164,18 +162,18 @@ def node_report(
 
 
 def _known(facts: Facts) -> dict[str, JsonValue]:
-    """What is known, as it is written."""
+    """The known facts, as they are written."""
     return facts.model_dump(mode='json', exclude_unset=True)
 
 
 def write(path: Path, report: NodeReport) -> None:
-    """Write a node's report; `folder.report_path` names the place."""
+    """Write a node's report; `folder.report_path` gives the path."""
     path.parent.mkdir(parents=True, exist_ok=True)
     atomic_write(path, json.dumps(_known(report), indent=2) + '\n')
 
 
 def read(path: Path) -> NodeReport:
-    """One node's report.
+    """Read a node's report.
 
     Raises:
         RunFolderError: it is damaged, or not a node's report.
@@ -186,7 +184,7 @@ def read(path: Path) -> NodeReport:
 
 
 def read_all(folder: Path) -> dict[str, NodeReport]:
-    """All node reports that are there, by `<role>-<name>`.
+    """Read all node reports of a run, by `<role>-<name>`.
 
     Raises:
         RunFolderError: one of them is damaged.

@@ -15,7 +15,7 @@ FAULTS = ('lost', 'duplicated', 'refused')
 
 
 class Evaluation(Facts):
-    """How a policy did in the episodes of one evaluation."""
+    """The results of a policy in the episodes of one evaluation."""
 
     step: int = Field(description='training steps that the policy has learnt from')
     version: int = Field(description='version of the policy; -1: random')
@@ -34,25 +34,25 @@ class Evaluation(Facts):
     )
     score_std: Number = Field(description='their standard deviation')
     length_mean: Number = Field(description='mean length of the episodes [steps]')
-    episodes: int = Field(description='how many episodes there were')
+    episodes: int = Field(description='number of episodes')
 
 
 class RewardRecovery(Facts):
-    """How well labels agree with the environment's own rewards when a policy was evaluated."""
+    """The agreement of labels with the environment's own rewards at an evaluation."""
 
     step: int = Field(description='training steps that the policy has learnt from')
     pearson: Number = Field(
-        description='correlation over all steps; null where one side does not vary'
+        description='correlation over all steps; null if one side does not vary'
     )
     within: Number = Field(
-        description="correlation after each segment's mean was taken from both sides"
+        description="correlation after subtracting each segment's mean from both sides"
     )
     spearman: Number = Field(description='rank correlation over all steps')
-    steps: int = Field(description='how many labelled steps were compared')
+    steps: int = Field(description='number of labelled steps that were compared')
 
 
 class MessageCounts(Facts):
-    """How many messages a topic carried, and what became of them."""
+    """The numbers of messages that a topic carried, and what became of them."""
 
     published: int = Field(description='by all nodes')
     recorded: int = Field(description='in the bag')
@@ -64,44 +64,43 @@ class MessageCounts(Facts):
 
 
 class ProcessUse(Facts):
-    """What a process took, and how it ended; null where that is not known."""
+    """The resources that a process used, and how it ended; null if not known."""
 
     role: str | None = Field(description='role of its node; `codetr` is the command itself')
     peak_rss_mb: float | None = Field(description='most memory that it had at once [MB]')
     cpu_s: float | None = Field(description='processor time [s]')
     wall_s: float | None = Field(description='time from its start to its end [s]')
-    finished: bool | None = Field(description='whether all that the run asked of it was done')
+    finished: bool | None = Field(description='whether it did everything that the run asked of it')
     error: str | None = Field(description='why it gave up')
     exit_code: int | None = Field(description='exit code; -N: ended by signal N')
 
 
 class RunSummary(Facts):
-    """What a run was, how it went and what came out: the content of `summary.json`."""
+    """The identity, course and results of a run: the content of `summary.json`."""
 
     run_id: str = Field(description='name of the run')
-    task: str = Field(description='what was simulated')
+    task: str = Field(description='task that was simulated')
     composite: str = Field(description="how a segment's rewards made its composite reward")
     delay: int = Field(description='length n of a segment [steps]')
     method: str = Field(description='how step rewards were made from composite rewards')
     seed: int = Field(description='seed of everything random')
     overlap: bool = Field(description='whether simulation ran a phase ahead of learning')
     in_process: bool = Field(description='whether it ran in one process, without topics')
-    interrupted: bool = Field(description='whether somebody ended it before it had finished')
+    interrupted: bool = Field(description='whether the user ended it before it had finished')
     failure: str | None = Field(description='why it failed; null if it did not')
     steps: int = Field(description='environment steps of the committed phases')
-    steps_planned: int = Field(description='environment steps that it was to take')
+    steps_planned: int = Field(description='environment steps that were planned')
     phases: int = Field(description='phases that were committed')
-    phases_planned: int = Field(description='phases that it was to have')
-    wall_s: float = Field(description='time that it took, the start of its processes included [s]')
+    phases_planned: int = Field(description='phases that were planned')
+    wall_s: float = Field(description='its duration, the start of its processes included [s]')
     steps_per_s: float | None = Field(description='environment steps per second of that time')
     evaluations: list[Evaluation] = Field(description='in the order of training steps')
     random: Evaluation | None = Field(
-        description='how the uniformly random policy did; null if it was not evaluated'
+        description='results of the uniformly random policy; null if it was not evaluated'
     )
     reward_recovery: list[RewardRecovery] = Field(
         [],
-        description='whenever a policy was due for evaluation and there were labels; summaries of '
-        'the first versions lack it',
+        description='a row for each evaluation with labels; the first summaries lack it',
     )
     random_score: Number = Field(description='mean score of the random policy')
     final_score: Number = Field(description='mean score of the last evaluation')
@@ -117,24 +116,24 @@ class RunSummary(Facts):
     refused: int = Field(description='refused messages, all topics together')
     bag: str | None = Field(description="folder of the run's bag; null without one")
     processes: dict[str, ProcessUse] = Field(
-        description='what each process took, by `<role>-<name>` of its node'
+        description='resources that each process used, by `<role>-<name>` of its node'
     )
     counters: dict[str, Counts] = Field(
-        description='what else the nodes counted, by `<role>-<name>` of the node'
+        description='other counts of the nodes, by `<role>-<name>` of the node'
     )
     versions: dict[str, str | None] = Field(
-        description='versions of what decides the numbers; null for what is not installed'
+        description='versions of the packages that decide the numbers; null if not installed'
     )
     settings_hash: str = Field(description="sha256 of the settings' canonical JSON")
     settings: dict[str, JsonValue] = Field(description='every setting of the run')
 
     @property
     def complete(self) -> bool:
-        """Whether all that was planned was done."""
+        """Whether everything planned was done."""
         return self.steps == self.steps_planned and not self.interrupted and not self.failure
 
     def evaluated(self) -> Sequence[Evaluation]:
-        """The random policy, where it was evaluated, and all evaluations after it."""
+        """The random policy, if it was evaluated, and all evaluations after it."""
         return [*([self.random] if self.random else []), *self.evaluations]
 
 
@@ -151,8 +150,5 @@ def read(path: Path) -> RunSummary:
         RunFolderError: it is damaged, or not the summary of a run.
     """
     return facts.read(
-        RunSummary,
-        path,
-        'summary',
-        'give the folder of a run that `codetr train` has made',
+        RunSummary, path, 'summary', 'give the folder of a run that `codetr train` has made'
     )

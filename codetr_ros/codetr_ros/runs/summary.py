@@ -1,6 +1,6 @@
-"""What a run leaves when it is over: `summary.json` and `metrics.csv`.
+"""The files that describe a finished run: `summary.json` and `metrics.csv`.
 
-Both are made from the run's records and from the reports that its nodes leave.
+Both are made from the run's records and from the reports of its nodes.
 """
 
 import csv
@@ -38,21 +38,21 @@ _T = TypeVar('_T')
 
 @dataclass
 class _Results:
-    """Episodes of an evaluation or of a phase's training: each once, however often told."""
+    """Episodes of an evaluation or of a phase's training: each once, however often received."""
 
     version: int
-    told: dict[tuple[str, int], EpisodeResult] = field(default_factory=dict)
+    by_episode: dict[tuple[str, int], EpisodeResult] = field(default_factory=dict)
 
     def add(self, result: EpisodeResult) -> None:
-        self.told[result.source, result.episode] = result
+        self.by_episode[result.source, result.episode] = result
 
     @property
     def episodes(self) -> list[EpisodeResult]:
-        """In an order that does not depend on who was heard first."""
-        return [result for _, result in sorted(self.told.items())]
+        """The episodes, in an order that does not depend on that of arrival."""
+        return [result for _, result in sorted(self.by_episode.items())]
 
     def numbers(self) -> dict[str, float]:
-        """Means and spread; not a number where an episode's are not."""
+        """Means and spread; NaN if a number of an episode is NaN."""
         episodes = self.episodes
         true = np.array([e.true_return for e in episodes])
         score = np.array([e.score for e in episodes])
@@ -73,19 +73,19 @@ class _Results:
                 'step': step,
                 'version': self.version,
                 **self.numbers(),
-                'episodes': len(self.told),
+                'episodes': len(self.by_episode),
             }
         )
 
 
 class Summary:
-    """Gathers what a run's nodes say and makes its summary.
+    """Gathers the records of a run and makes its summary.
 
     Args:
         settings: the run's settings.
         run_id: its name.
         in_process: whether it ran without topics.
-        clock: seconds, never going back; the run's time begins now.
+        clock: seconds, never going back; the time of the run begins now.
     """
 
     def __init__(
@@ -109,17 +109,17 @@ class Summary:
         self._wall: float | None = None  # seconds that the run took, once it is over
 
     def receive(self, record: Record) -> None:
-        """Take note of a record of the run, of whatever kind.
+        """Note a record of the run, of any kind.
 
-        Episodes, metrics and commits may come more than once, true rewards and labels must not.
+        Episodes, metrics and commits may come more than once; true rewards and labels must not.
 
         Raises:
-            RecoveryError: labels come whose steps' true rewards have not all come before.
+            RecoveryError: labels come before some of the true rewards of their steps.
         """
         self._recovery.receive(record)
         if isinstance(record, EpisodeResult):
             if record.purpose == 'training':
-                # the last phase that a step belongs to: step 1000 of 1000-step phases ends phase 0
+                # step 1000 of 1000-step phases ends phase 0
                 phase = max(0, record.step - 1) // self.settings.phase_steps
                 self._training.setdefault(phase, _Results(record.version)).add(record)
             elif record.purpose == 'random':
@@ -150,15 +150,15 @@ class Summary:
         return self._clock() - self._began if self._wall is None else self._wall
 
     def end(self) -> None:
-        """The run is over: what is learnt about it from now on takes none of its time."""
+        """End the time of the run; records may still come."""
         self._wall = self.wall_s
 
     def evaluations(self) -> list[Evaluation]:
-        """One row for each evaluation, in order of training steps."""
+        """A row for each evaluation, in order of training steps."""
         return [results.row(step) for step, results in sorted(self._evaluations.items())]
 
     def random(self) -> Evaluation | None:
-        """How the uniformly random policy did, or None where it was not evaluated."""
+        """The row of the uniformly random policy; None if it was not evaluated."""
         return self._random.row(0) if self._random else None
 
     def build(
@@ -168,12 +168,12 @@ class Summary:
         interrupted: bool = False,
         failure: str | None = None,
     ) -> RunSummary:
-        """The content of `summary.json`; what is not known is None.
+        """The content of `summary.json`; unknown values are None.
 
         Args:
-            reports: what the nodes said at their end, by `<role>-<name>`.
-            bag: the folder with the run's bag, if there is one.
-            interrupted: somebody ended the run before it had finished.
+            reports: the nodes' reports, by `<role>-<name>`.
+            bag: the folder of the run's bag, if there is one.
+            interrupted: the user ended the run before it had finished.
             failure: why the run failed, if it did.
         """
         settings, wall = self.settings, self.wall_s
@@ -228,18 +228,18 @@ class Summary:
     def metrics_csv(self) -> str:
         """The content of `metrics.csv`: a row for each phase, a column for each number.
 
-        Columns are `step`, `phase`, `<role>.<metric>` (or `<node>.<metric>` where a role has
-        several nodes), the means of the training episodes that ended in the phase, and the
-        evaluation of the policy that the phase's training made. The first row, at step 0, is the
-        random policy. A cell is empty where there is no number.
+        Columns are `step`, `phase`, `<role>.<metric>` (or `<node>.<metric>` if a role has several
+        nodes), the means of the training episodes that ended in the phase, and the evaluation of
+        the policy after the phase's training. The first row, at step 0, is the random policy. A
+        cell without a number is empty.
         """
         nodes: dict[str, set[str]] = defaultdict(set)
-        for said in self._metrics.values():
-            for role, node, _ in said:
+        for values in self._metrics.values():
+            for role, node, _ in values:
                 nodes[role].add(node)
         rows: dict[int, dict[str, float]] = defaultdict(dict)
-        for phase, said in self._metrics.items():
-            for (role, node, name), value in said.items():
+        for phase, values in self._metrics.items():
+            for (role, node, name), value in values.items():
                 place = role if len(nodes[role]) == 1 else node.rsplit('/', 1)[-1]
                 rows[phase][f'{place}.{name}'] = value
         for phase, results in self._training.items():
@@ -255,7 +255,7 @@ class Summary:
             evaluated.append((-1, self._random))
         for version, results in evaluated:
             rows[version] |= {f'evaluation.{n}': v for n, v in results.numbers().items()}
-            rows[version]['evaluation.episodes'] = len(results.told)
+            rows[version]['evaluation.episodes'] = len(results.episodes)
         columns = sorted({column for row in rows.values() for column in row})
         text = io.StringIO()
         writer = csv.writer(text, lineterminator='\n')
@@ -269,8 +269,8 @@ class Summary:
 
 
 def count_messages(reports: Mapping[str, NodeReport]) -> dict[str, MessageCounts]:
-    """How many messages each topic carried, and what became of them; topics that carried none are
-    there too.
+    """The numbers of messages of each topic, and what became of them; a topic without messages has
+    a row too.
     """
     columns: dict[str, Counter[str]] = {name: Counter() for name in MessageCounts.model_fields}
     for report in reports.values():
@@ -290,7 +290,7 @@ def count_messages(reports: Mapping[str, NodeReport]) -> dict[str, MessageCounts
 
 
 def processes(reports: Mapping[str, NodeReport]) -> dict[str, ProcessUse]:
-    """What each process took, and this one too."""
+    """The resources that each process used, this one included."""
     used = {
         name: ProcessUse(
             role=report.role,
@@ -323,5 +323,5 @@ def write(folder: Path, summary: RunSummary, metrics_csv: str) -> None:
 
 
 def _first(values: Iterable[_T | None]) -> _T | None:
-    """The first that is known."""
+    """The first known value."""
     return next((value for value in values if value is not None), None)
