@@ -1,9 +1,9 @@
 """The nodes of a run in one namespace: `ros2 launch codetr_ros train.launch.py config:=quick`.
 
-Which ones the run needs follows from its settings. They start in any order and wait for each
-other; the launch ends when the recorder has, which is last. There is one simulator: a run with the
-setting `simulators` above 1 waits until the others are started by hand, each with a name of its
-own, `ros2 run sim_node sim --ros-args -r __ns:=/codetr -r __node:=sim_2`.
+The settings of the run decide which nodes it needs. They start in any order and wait for each
+other. The launch ends with the recorder, which is the last node to end. It starts one simulator: a
+run with the setting `simulators` above 1 waits until the others are started by hand, each with a
+name of its own, `ros2 run sim_node sim --ros-args -r __ns:=/codetr -r __node:=sim_2`.
 """
 
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
@@ -31,10 +31,10 @@ ARGUMENTS = {
 
 
 def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
-    """The nodes; only the learner is told what to do, the others take it from the run."""
+    """The nodes; only the learner gets settings, and the others take them from the run."""
     value = {name: LaunchConfiguration(name) for name in ARGUMENTS}
     shared = {name: value[name] for name in ('folder', 'run_id', 'peer_deadline')}
-    found = {
+    processes = {
         role: Node(
             package=TABLE[role].package,
             executable=TABLE[role].executable,
@@ -47,11 +47,11 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     }
     end = RegisterEventHandler(
         OnProcessExit(
-            target_action=found['record'],
+            target_action=processes['record'],
             on_exit=[EmitEvent(event=Shutdown(reason='the run is over'))],
         )
     )
-    return [*found.values(), end]
+    return [*processes.values(), end]
 
 
 def generate_launch_description() -> LaunchDescription:

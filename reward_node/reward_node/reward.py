@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 def load() -> 'MakeCore':
     """Import the core and return what makes it."""
-    import torch._dynamo  # noqa: F401 - the first optimiser imports it: seconds, amid the run
+    import torch._dynamo  # noqa: F401 - else the first optimiser imports it during the run: seconds
 
     from codetr_ros.cores.labeller import Labeller
 

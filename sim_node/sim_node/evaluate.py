@@ -1,4 +1,4 @@
-"""`ros2 run sim_node evaluate`: evaluates the policies of the run, beside it, delaying nothing."""
+"""`ros2 run sim_node evaluate`: evaluates the policies of the run without delaying it."""
 
 import sys
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""`ros2 run sim_node sim`: simulates the task of the run under the policies that it is sent."""
+"""`ros2 run sim_node sim`: simulates the task of the run under the policies it receives."""
 
 import sys
 from typing import TYPE_CHECKING

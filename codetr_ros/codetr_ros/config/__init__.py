@@ -1,4 +1,4 @@
-"""The one configuration of a run: typed, validated, and the origin of CLI flags, YAML keys and ROS
+"""The one configuration of a run: typed, validated, and the source of CLI flags, YAML keys and ROS
 parameters.
 """
 

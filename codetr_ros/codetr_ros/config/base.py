@@ -1,4 +1,4 @@
-"""What all settings have in common: how they are validated, and what a refusal names."""
+"""The base of all settings: how they are validated, and what a refusal names."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, TypeVar
@@ -13,8 +13,8 @@ class SettingsError(ValueError):
 
 
 class Group(BaseModel):
-    """Base of all settings: immutable, nothing unknown, nothing converted that would hide a
-    mistake.
+    """Base of all settings: immutable. Unknown fields are refused, and values are never converted
+    silently.
     """
 
     model_config = ConfigDict(
@@ -23,7 +23,7 @@ class Group(BaseModel):
 
 
 def flatten(data: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
-    """Values of nested mappings, each with its dotted name."""
+    """The values of nested mappings, each with its dotted name."""
     for key, value in data.items():
         if isinstance(value, Mapping):
             yield from flatten(value, f'{prefix}{key}.')
@@ -39,7 +39,7 @@ def validate(kind: type[_G], data: Any, source: str) -> _G:
 
     Args:
         kind: the group.
-        data: nested mapping of settings; what is missing keeps its default.
+        data: nested mapping of settings; a missing setting keeps its default.
         source: where they came from (a file, a node, the command line), for the error.
 
     Raises:
@@ -52,11 +52,11 @@ def validate(kind: type[_G], data: Any, source: str) -> _G:
 
 
 def explain(error: ValidationError, source: str) -> str:
-    """What pydantic refuses, a line for each value: where it came from, name, value and reason."""
+    """The refusals of pydantic, a line for each value: its source, name, value and the reason."""
     lines = []
     for e in error.errors():
         name = '.'.join(str(part) for part in e['loc']) or 'settings'
         value = '' if isinstance(e['input'], Mapping) else f' = {e["input"]!r}'
-        said = 'there is no such setting' if e['type'] == 'extra_forbidden' else e['msg']
-        lines.append(f'{source}: {name}{value}: {said}')
+        reason = 'there is no such setting' if e['type'] == 'extra_forbidden' else e['msg']
+        lines.append(f'{source}: {name}{value}: {reason}')
     return '\n'.join(lines)

@@ -18,7 +18,7 @@ def parse(data: Mapping[str, Any], source: str) -> Settings:
     """Validate settings that came from outside.
 
     Args:
-        data: nested mapping of settings; what is missing keeps its default.
+        data: nested mapping of settings; a missing setting keeps its default.
         source: where they came from (a file, a node, the command line), for the error.
 
     Raises:
@@ -31,7 +31,7 @@ def load(name: str) -> Settings:
     """Settings of a preset (`quick`, `cpu`, `paper`) or of a YAML file.
 
     Raises:
-        SettingsError: no such preset or file, not YAML, or a setting that is refused.
+        SettingsError: there is no such preset or file, it is not YAML, or a setting is refused.
     """
     if name in PRESETS:
         text = resources.files('codetr_ros.config.presets').joinpath(f'{name}.yaml').read_text()
@@ -56,7 +56,7 @@ def from_canonical(text: str, source: str) -> Settings:
     """Settings from the JSON of a `RunSpec`.
 
     Raises:
-        SettingsError: not JSON, or a setting that is refused.
+        SettingsError: it is not JSON, or a setting is refused.
     """
     try:
         data = json.loads(text)

@@ -44,18 +44,18 @@ class CodetrSettings(Group):
     )
     tokens: Literal['pair', 'merged'] = Field(
         'pair',
-        description='pair: a state and an action token per step, as the paper; merged: one, '
-        'twice as fast',
+        description='pair: a state and an action token per step, as in the paper; merged: one '
+        'token per step, twice as fast',
     )
     head_scale: Literal['inverse', 'inverse_sqrt', 'one'] = Field(
         'inverse_sqrt',
-        description='factor on the in-sequence logits: 1/d, 1/sqrt(d) (decided here) '
-        'or 1 (published code)',
+        description='factor on the in-sequence logits: 1/d, 1/sqrt(d) (decided here) or 1 '
+        '(published code)',
     )
     initialisation: Literal['gpt2', 'lecun'] = Field(
         'gpt2',
-        description='initial weights: small, nearly one step at a time, as GPT-2 (decided here), '
-        'or of variance 1/inputs',
+        description='initial weights: small, nearly one step at a time, as in GPT-2 (decided '
+        'here), or of variance 1/inputs',
     )
     weights: Literal['attention', 'one'] = Field(
         'attention',
@@ -63,17 +63,16 @@ class CodetrSettings(Group):
     )
     attention_scope: Literal['segment', 'window'] = Field(
         'segment',
-        description='in-sequence attention sees the segment only, or the context before it as '
-        'well',
+        description='what in-sequence attention sees: the segment, or also the context before it',
     )
     context: Literal['segment', 'episode'] = Field(
         'segment',
-        description='the causal transformer starts at the segment, or up to `window` steps '
+        description='start of the causal transformer: at the segment, or up to `window` steps '
         'before it',
     )
     label: Literal['product', 'rhat'] = Field(
         'product',
-        description='the step reward: w_t * rhat_t, whose sum is the prediction, or rhat_t',
+        description='step reward: w_t * rhat_t, whose sum is the prediction, or rhat_t',
     )
     labelling: Literal['segment', 'window'] = Field(
         'segment',
@@ -88,14 +87,14 @@ class CodetrSettings(Group):
         256,
         ge=1,
         le=65536,
-        description='segments or windows labelled between two looks at arriving messages; a GPU '
-        'wants thousands',
+        description='segments or windows labelled between two checks for messages; a GPU needs '
+        'thousands',
     )
     precision: Literal['float32', 'bfloat16'] = Field(
         'float32',
-        description="of the causal layers' products; weights and heads are float32 in any case. "
-        'bfloat16 rounds to 8 bits, and is faster for large networks where the processor has it '
-        '(avx512_bf16, amx); on a GPU it makes labels faster, gradient steps slower',
+        description="number format of the causal layers' products; weights and heads are always "
+        'float32. bfloat16 rounds to 8 bits, and is faster for large networks on processors with '
+        'avx512_bf16 or amx; on a GPU it makes labels faster, gradient steps slower',
     )
 
     @model_validator(mode='after')
@@ -106,9 +105,9 @@ class CodetrSettings(Group):
 
 
 class RbtSettings(Group):
-    """What RBT has beyond the transformer, whose settings it shares with CoDeTr (`codetr`).
+    """The settings of RBT beyond the transformer, whose settings it shares with CoDeTr (`codetr`).
 
-    Of those, `weights`, `label`, `context` and `attention_scope` are CoDeTr's alone.
+    Of those, only CoDeTr uses `weights`, `label`, `context` and `attention_scope`.
     """
 
     state_loss_weight: float = Field(
@@ -116,8 +115,8 @@ class RbtSettings(Group):
     )
     attention_scope: Literal['segment', 'window'] = Field(
         'window',
-        description='attention sees the segments that fit into `codetr.window` steps (two at '
-        'least), as published, or one only',
+        description='what attention sees: the segments that fit into `codetr.window` steps, at '
+        'least two, as published; or one segment',
     )
 
 
@@ -143,7 +142,7 @@ class PerceptronSettings(Group):
 
 
 class MlpSettings(PerceptronSettings):
-    """The Markovian control: trained on segments as the transformer is."""
+    """The Markovian control: trained on segments like the transformer."""
 
     batch: int = Field(64, ge=1, le=65536, description='segments in a gradient step')
 
@@ -153,7 +152,7 @@ class RrdSettings(PerceptronSettings):
 
     loss: Literal['biased', 'unbiased'] = Field(
         'biased',
-        description='the published default, or less the variance that the drawing of steps adds',
+        description='the published default, or that loss less the variance from drawing steps',
     )
     subsequences: int = Field(
         4, ge=1, le=65536, description='segments in a gradient step, drawn by their lengths'
@@ -173,7 +172,7 @@ class RrdSettings(PerceptronSettings):
 
 
 class SacSettings(Group):
-    """Soft actor-critic as jaxrl has it."""
+    """Soft actor-critic as in jaxrl."""
 
     hidden: Hidden = Field(
         (256, 256), min_length=1, max_length=8, description='hidden layer widths'
@@ -197,27 +196,25 @@ class SacSettings(Group):
         -0.5,
         ge=-10,
         le=10,
-        description='target entropy in units of the action size: -0.5 as jaxrl, often -1 '
+        description='target entropy in units of the action size: -0.5 as in jaxrl, often -1 '
         'elsewhere',
     )
     updates_per_step: float = Field(1.0, ge=0, le=100, description='updates per environment step')
-    burst: int = Field(
-        50, ge=1, le=100_000, description='updates between two looks at arriving messages'
-    )
+    burst: int = Field(50, ge=1, le=100_000, description='updates between two checks for messages')
     compile: bool = Field(
         True,
-        description='compile the update for this processor, or the GPU of `device`: faster, but '
-        'needs a C++ compiler, and the first start takes about half a minute more, later ones '
-        'some seconds (what was compiled is kept in ~/.cache/codetr_ros/torch)',
+        description='compile the update for this processor, or the GPU of `device`. It is faster, '
+        'but needs a C++ compiler; the first start takes about half a minute longer, later ones '
+        'some seconds (compiled code is kept in ~/.cache/codetr_ros/torch)',
     )
 
 
 class HcSettings(Group):
-    """The critic of method `hc` (Han et al., arXiv 2106.11854); the rest of it is `sac`'s."""
+    """The critic of method `hc` (Han et al., arXiv 2106.11854); it takes the rest from `sac`."""
 
     history: Literal['singleton', 'recurrent'] = Field(
         'recurrent',
-        description='value of the history: a sum over its steps, or of a GRU that reads it',
+        description='value of the history: a sum over its steps, or that of a GRU over them',
     )
     regulariser: float = Field(
         5.0,
@@ -230,13 +227,13 @@ class HcSettings(Group):
         16,
         ge=1,
         le=65536,
-        description='segments from which the sac.batch steps of an update are drawn '
-        '(decided here)',
+        description='segments from which the sac.batch steps of an update are drawn (decided '
+        'here)',
     )
 
 
 class LirpgSettings(Group):
-    """PPO with a learnt intrinsic reward (Zheng et al., arXiv 1804.06459); its constants."""
+    """PPO with a learnt intrinsic reward and its constants (Zheng et al., arXiv 1804.06459)."""
 
     hidden: Hidden = Field(
         (64, 64), min_length=1, max_length=8, description='hidden layer widths of all networks'
@@ -259,12 +256,12 @@ class LirpgSettings(Group):
         0.95, ge=0, le=1, description='lambda of the generalised advantage estimation'
     )
     intrinsic_coefficient: float = Field(
-        1.0, ge=0, le=1e6, description='weight of the intrinsic reward in what the policy learns'
+        1.0, ge=0, le=1e6, description='weight of the intrinsic reward for the policy'
     )
     extrinsic_coefficient: float = Field(
-        0.0, ge=0, le=1e6, description='weight of the scores in what the policy learns'
+        0.0, ge=0, le=1e6, description='weight of the scores for the policy'
     )
     value_coefficient: float = Field(0.5, ge=0, le=1e6, description='weight of the value losses')
     gradient_norm: float = Field(
-        0.5, gt=0, le=1e6, description='gradients are shortened to this norm'
+        0.5, gt=0, le=1e6, description='largest norm of a gradient; longer ones are shortened'
     )

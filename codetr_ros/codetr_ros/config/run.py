@@ -1,9 +1,9 @@
-"""The one configuration of a run: typed, validated, and the origin of CLI flags, YAML keys and ROS
+"""The one configuration of a run: typed, validated, and the source of CLI flags, YAML keys and ROS
 parameters.
 
-The defaults are the paper's (its supplement's Table 1 and A.2; where that is silent, the decision
-is marked "decided here"). Presets change some of them: `quick`, `cpu` and `paper` are the YAML
-files of `presets/`.
+The defaults are the paper's (its supplement's Table 1 and A.2). Decisions that the paper leaves
+open are marked "decided here". The presets `quick`, `cpu` and `paper`, the YAML files of
+`presets/`, change some defaults.
 """
 
 import hashlib
@@ -37,16 +37,16 @@ Method = Literal[
 
 
 IN_PROCESS_ONLY = {
-    'true': 'is a reference that looks at what no node may see',
+    'true': 'is a reference that uses true rewards, which no node may see',
     'ones': 'is a reference that ignores the scores',
     'lirpg': 'learns on-policy, each phase from its own steps alone',
 }
-"""Methods that run without nodes only, and what keeps them from it."""
+"""Methods that run in process only, and the reason."""
 
 
 SCORE_LEARNERS: tuple[str, ...] = ('hc', 'lirpg')
-"""Methods whose policy learner learns from the composite rewards themselves: no reward node labels
-steps for it."""
+"""Methods whose policy learner learns from the composite rewards themselves, without a reward node
+that labels steps."""
 
 
 class Settings(Schedule, Group):
@@ -63,7 +63,7 @@ class Settings(Schedule, Group):
         25,
         ge=1,
         le=100_000,
-        description='steps n of a segment: one composite reward comes for each',
+        description='steps n of a segment; each segment has one composite reward',
     )
     method: Method = Field(
         'codetr', description='how step rewards are made from composite rewards'
@@ -79,16 +79,17 @@ class Settings(Schedule, Group):
     )
     overlap: bool = Field(
         False,
-        description='simulate phase k under what phase k-2 taught, while phase k-1 is learnt from',
+        description='simulate phase k with the policy learnt up to phase k-2, while phase k-1 is '
+        'learnt from',
     )
     simulators: int = Field(
-        1, ge=1, le=64, description='simulators among whom the steps of a phase are divided'
+        1, ge=1, le=64, description='simulators that share the steps of a phase'
     )
     envs: int = Field(
         1,
         ge=1,
         le=64,
-        description='environments of each simulator, among which its steps are divided',
+        description='environments of each simulator, which share its steps',
     )
     memory_steps: int = Field(
         1_000_000, ge=1, le=10**9, description='steps that the memory D holds'
@@ -101,7 +102,7 @@ class Settings(Schedule, Group):
         None,
         gt=0,
         le=1e9,
-        description="largest reward of a step, for scores; the task's own where not given",
+        description="largest reward of a step, for scores; if not given, the task's own",
     )
     target_scale: Literal['rms', 'none'] = Field(
         'rms',
@@ -110,27 +111,26 @@ class Settings(Schedule, Group):
     )
     reward_unit: Literal['scaled', 'raw'] = Field(
         'scaled',
-        description='step rewards that the learner sees: in units of c (decided here), or '
-        'unscaled',
+        description='step rewards for the learner: in units of c (decided here), or unscaled',
     )
     relabel_steps: int = Field(
         0,
         ge=0,
         le=10**9,
-        description='steps of the memory that are labelled again in a phase, whole segments with '
-        'the oldest labels first, one at least; what is new is always labelled; 0: all',
+        description='steps of the memory to label again in a phase: whole segments, oldest labels '
+        'first, at least one; new steps are always labelled; 0: all',
     )
     relabel: Literal['all', 'drawn'] = Field(
         'all',
-        description='steps of the memory that are labelled again in a phase: all, or those that '
-        'the updates after it will draw, which is known beforehand: SAC sees the newest labels '
-        'either way. Worth its while with `codetr.labelling` window in a large memory; else whole '
-        'segments are labelled that hold such a step',
+        description='steps of the memory to label again in a phase: all, or those that the next '
+        'updates will draw, which are known beforehand. SAC sees the newest labels either way. '
+        'drawn pays with `codetr.labelling` window in a large memory; with segment it labels '
+        'every segment that holds such a step',
     )
     record_relabels: Literal['first', 'all'] = Field(
         'first',
-        description='labels in the bag: the first of each segment and, at evaluations, all that '
-        'the phase gave, or every one',
+        description='labels in the bag: the first of each segment and, at evaluations, all labels '
+        'of the phase; or every label',
     )
     threads: int = Field(1, ge=1, le=256, description='torch threads of each process')
     device: str = Field(
@@ -142,7 +142,7 @@ class Settings(Schedule, Group):
         'cpu',
         pattern=r'^(cpu|cuda(:\d{1,2})?)$',
         description='where a reward model with a network learns and labels: cpu, or the GPU cuda, '
-        'cuda:1, ... of the reward node; all else runs on the CPU',
+        'cuda:1, ... of the reward node; everything else runs on the CPU',
     )
     codetr: CodetrSettings = Field(
         default_factory=CodetrSettings, description='the reward transformer'
@@ -191,9 +191,9 @@ class Settings(Schedule, Group):
             )
         if self.device != 'cpu':
             raise ValueError(
-                f'relabel={self.relabel} with device={self.device}: SAC draws there from a '
-                "generator of the device's own, and nobody else knows what; set device=cpu or "
-                'relabel=all'
+                f'relabel={self.relabel} with device={self.device}: SAC draws there '
+                'from a generator of that device, whose draws no other node knows; set '
+                'device=cpu or relabel=all'
             )
         if self.relabel_steps:
             raise ValueError(
@@ -205,7 +205,7 @@ class Settings(Schedule, Group):
 
     @property
     def labels_steps(self) -> bool:
-        """Whether a reward method labels steps, from which the policy is then learnt."""
+        """Whether a reward method labels steps, from which the policy learner learns."""
         return self.method not in SCORE_LEARNERS
 
     @property
@@ -214,7 +214,7 @@ class Settings(Schedule, Group):
         return self.relabel == 'all' and not self.relabel_steps
 
     def canonical(self) -> str:
-        """The settings as JSON, the same for the same settings on every machine."""
+        """The settings as JSON. Equal settings give the same text on every machine."""
         return json.dumps(self.model_dump(mode='json'), sort_keys=True, separators=(',', ':'))
 
     def hash(self) -> str:
@@ -222,7 +222,7 @@ class Settings(Schedule, Group):
         return hashlib.sha256(self.canonical().encode()).hexdigest()
 
     def run_spec(self, run_id: str) -> RunSpec:
-        """The record that says what run this is."""
+        """The record that announces the run."""
         return RunSpec(
             run_id=run_id,
             protocol_version=PROTOCOL_VERSION,
@@ -232,15 +232,15 @@ class Settings(Schedule, Group):
         )
 
     def flat(self) -> dict[str, Any]:
-        """Every setting by its dotted name, as ROS parameters and errors call it."""
+        """Every setting by its dotted name, as in ROS parameters and errors."""
         return dict(flatten(self.model_dump()))
 
     def changed(self, changes: Mapping[str, Any], source: str = 'change') -> 'Settings':
         """A copy with some settings changed, given by dotted name.
 
         Raises:
-            SettingsError: a name is unknown or a value is not allowed; `source` says where it came
-                from.
+            SettingsError: a name is unknown or a value is not allowed; `source` names its
+                origin.
         """
         data = self.model_dump()
         for name, value in changes.items():

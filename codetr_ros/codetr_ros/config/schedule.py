@@ -1,4 +1,4 @@
-"""What follows from the settings of a run: phases, shares, sources, evaluations."""
+"""Phases, shares, sources and evaluations that follow from the settings of a run."""
 
 from typing import TYPE_CHECKING
 
@@ -8,7 +8,7 @@ from codetr_ros.records import roles
 class Schedule:
     """The arithmetic of a run, mixed into its settings."""
 
-    if TYPE_CHECKING:  # fields of `Settings`: annotated otherwise, they would come first there
+    if TYPE_CHECKING:  # fields of `Settings`; with annotations at run time they would come first
         steps: int
         phase_steps: int
         warmup_steps: int
@@ -28,12 +28,12 @@ class Schedule:
 
     @property
     def warmup_phases(self) -> int:
-        """Phases under the random policy: a phase begun is ended so."""
+        """Phases under the random policy, which ends the last of them too."""
         return min(self.phases, -(-self.warmup_steps // self.phase_steps))
 
     @property
     def lag(self) -> int:
-        """Phases from what taught a policy to where it acts: 1 in lock-step, 2 with overlap."""
+        """Phases between learning a policy and acting under it: 1 in lock-step, 2 with overlap."""
         return 2 if self.overlap else 1
 
     def steps_of(self, phase: int) -> int:
@@ -41,8 +41,8 @@ class Schedule:
         return max(0, min(self.phase_steps, self.steps - phase * self.phase_steps))
 
     def shares_of(self, phase: int) -> list[int]:
-        """Steps that each source takes of a phase: the first ones take one more where it does not
-        divide.
+        """Steps of a phase for each source. If they do not divide evenly, the first sources take
+        one more.
         """
         share, rest = divmod(self.steps_of(phase), self.source_count)
         return [share + (i < rest) for i in range(self.source_count)]
@@ -52,11 +52,11 @@ class Schedule:
         return min(self.steps, (version + 1) * self.phase_steps)
 
     def evaluated(self, version: int) -> bool:
-        """Whether this policy version is evaluated: the last one, and the first past each
-        multiple.
+        """Whether this policy version is evaluated: the last one is, and the first past each
+        multiple of `evaluate_every`.
 
-        Policies of the warm-up act at random and are not evaluated again: the random policy is,
-        once, at step 0.
+        Policies of the warm-up act at random and are not evaluated: the random policy is, once, at
+        step 0.
         """
         if self.evaluate_every == 0 or version < self.warmup_phases - 1:
             return False
@@ -74,22 +74,22 @@ class Schedule:
 
     @property
     def source_count(self) -> int:
-        """Sources of the run: environments of all simulators."""
+        """Number of sources of the run: the environments of all simulators."""
         return self.simulators * self.envs
 
     def sources_of(self, simulator: str) -> tuple[str, ...]:
-        """Names of a simulator's sources: its own where it has one environment; sim-1, sim-2, ...
-        where it has several.
+        """Names of a simulator's sources: its own name for one environment; sim-1, sim-2, ... for
+        several.
         """
         if self.envs == 1:
             return (simulator,)
         return tuple(f'{simulator}-{i}' for i in range(1, self.envs + 1))
 
     def simulator_of(self, source: str) -> str:
-        """The simulator whose source it is. No node's name has a hyphen."""
+        """The simulator of a source. No name of a node has a hyphen."""
         return source if self.envs == 1 else source.rpartition('-')[0]
 
     @property
     def roles(self) -> dict[str, int]:
-        """How many nodes of each role the run needs."""
+        """Number of nodes that the run needs of each role."""
         return roles.needed(self)

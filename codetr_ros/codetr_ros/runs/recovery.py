@@ -82,8 +82,8 @@ class _Source:
         self._versions[slots] = record.version
 
     def labelled(self, version: int | None) -> tuple[F32, F32, I64]:
-        """Labels, true rewards and segments (T,) of the labelled steps; if a version is given, only
-        of those that it labelled.
+        """Labels, true rewards and segments (T,) of the labelled steps, or only of those that a
+        given version labelled.
         """
         held = slice(min(self._end, self._capacity))
         there = ~np.isnan(self._labels[held])
