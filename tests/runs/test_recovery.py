@@ -167,7 +167,7 @@ def test_what_a_bag_lacks_labels_of_is_not_compared():
 @pytest.mark.parametrize(
     ('records', 'said'),
     [
-        ([], "'sim' told no true rewards"),
+        ([], "'sim' published no true rewards"),
         ([true_rewards(0, 0, 1.0), true_rewards(0, 2, 1.0)], 'before episode 0, step 2'),
         ([true_rewards(0, 0, 1.0), true_rewards(2, 0, 1.0)], 'before episode 2, step 0'),
         ([true_rewards(0, 5, 1.0)], 'before episode 0, step 5'),

@@ -53,7 +53,7 @@ class Overview(Display):
         """A cell begins; one that begins again is counted once."""
         self._running[job.cell] = (job, self._clock())
         if self._live is None:
-            self.say(f'begun: {job.cell}')
+            self.log(f'begun: {job.cell}')
 
     def ended(self, job: Job, ending: Mapping[str, Any]) -> None:
         """A cell has ended, as `Attempt.finish` says."""
@@ -62,16 +62,16 @@ class Overview(Display):
         took = duration(self._clock() - began)
         if ending['error'] is None:
             self._done += 1
-            self.say(f'done: {job.cell} in {took} ({self._counts()})')
+            self.log(f'done: {job.cell} in {took} ({self._counts()})')
             return
         self.failed[job.cell] = ending['error']
-        self.say(f'FAILED: {job.cell} after {took}: {ending["error"]}', 'bold red')
+        self.log(f'FAILED: {job.cell} after {took}: {ending["error"]}', 'bold red')
         for line in (ending['log'] or '').splitlines():
-            self.say(f'    {line}', 'dim')
+            self.log(f'    {line}', 'dim')
 
     def _plain(self) -> None:
         shown = ', '.join(f'{cell} {share:.0%}' for cell, share, _ in self._progress())
-        self.say(self._counts() + (f'; running: {shown}' if shown else ''))
+        self.log(self._counts() + (f'; running: {shown}' if shown else ''))
 
     def _progress(self) -> list[tuple[str, float, float]]:
         """Each running cell with the share of its phases learnt from and its seconds so far."""

@@ -48,17 +48,17 @@ def run(
         jobs, failed = _todo(spec, folder, retry_failed)
         done = len(spec.cells) - len(jobs) - len(failed)
         overview = Overview(folder, jobs, done)
-        overview.say(
+        overview.log(
             f'{len(spec.cells)} cells: {done} finished before, {len(failed)} failed before, '
             f'{len(jobs)} to be run'
         )
         if left:
-            overview.say(f'{left} runs that an earlier runner left unfinished were removed')
+            overview.log(f'{left} runs that an earlier runner left unfinished were removed')
         if failed:
-            overview.say('cells that failed before are run again with --retry-failed')
+            overview.log('cells that failed before are run again with --retry-failed')
         for job in jobs:
             if (aside := folder.set_aside(job.cell)) is not None:
-                overview.say(f'{job.cell} is not finished: what was there is now {aside}')
+                overview.log(f'{job.cell} is not finished: what was there is now {aside}')
         with overview:
             if ray is not None:
                 ray_pool.run(folder, jobs, ray, overview, stopped)
@@ -95,7 +95,7 @@ def _warn(jobs: list[Job], workers: int, overview: Overview) -> None:
     cores = processors.count()
     threads = max((job.threads for job in jobs), default=1)
     if workers * threads > cores:
-        overview.say(
+        overview.log(
             f'{workers} workers with {threads} threads each on {cores} cores: they will wait for '
             'each other; give fewer --workers, or lower config.threads or config.envs in the spec',
             'yellow',

@@ -135,12 +135,12 @@ def train(
         return refuse(str(error))
     summary = Summary(settings, run_id, in_process)
     progress = Progress(settings)
-    progress.say(
+    progress.log(
         f'{settings.task}: {settings.composite} of {settings.delay} steps, method '
         f'{settings.method}, {settings.steps} steps, seed {settings.seed}'
         + (', in process' if in_process else '')
     )
-    progress.say(f'output: {_short(folder)}')
+    progress.log(f'output: {_short(folder)}')
     with Interrupts() as interrupts:
         with progress:
             way = _in_process if in_process else partial(_over_topics, start)
@@ -187,7 +187,7 @@ def _in_process(
     try:
         return Outcome(in_process.run(settings, run_id, folder, observe, tick))
     except KeyboardInterrupt:
-        progress.say('stopped')
+        progress.log('stopped')
         return Outcome(node_reports.read_all(folder), interrupted=True)
     except Exception as error:  # noqa: BLE001
         # Whatever it was: what was learnt until now is worth a summary, which names the failure.
@@ -231,7 +231,7 @@ def _over_topics(
 
     failure = None
     asked = interrupts.again
-    with launcher.Processes(progress.say, asked, start_program=start) as processes:
+    with launcher.Processes(progress.log, asked, start_program=start) as processes:
         try:
             # The watcher first: what the nodes say from their start on is to be heard.
             with Watcher(receive, f'/run_{run_id}') as watcher:
@@ -274,20 +274,20 @@ def _complete(summary: Summary, folder: Path, progress: Progress, interrupts: In
     if not (folder / run_folder.BAG).exists():
         return  # no recorder came up, which the failure says
     asked = interrupts.count
-    progress.say('reading the bag for the summary')
+    progress.log('reading the bag for the summary')
     try:
         bag = Bag(folder / run_folder.BAG)
         # labels last: they may have been noted before true rewards of their phase
         for kinds in (EpisodeResult, Metrics, Commit, TrueRewards), (StepRewards,):
             for entry in bag.entries(kinds):
                 if interrupts.count > asked:
-                    progress.say('stopped: the summary holds what was read until now')
+                    progress.log('stopped: the summary holds what was read until now')
                     return
                 summary.receive(entry.record)
     except BagError as error:
-        progress.say(f'the summary holds what was heard, and of the bag what came before: {error}')
+        progress.log(f'the summary holds what was heard, and of the bag what came before: {error}')
     except RecoveryError as error:
-        progress.say(f'reward recovery cannot be told to the end: {error}')
+        progress.log(f'reward recovery cannot be told to the end: {error}')
 
 
 def _short(path: Path) -> str:

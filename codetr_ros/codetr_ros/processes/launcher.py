@@ -241,12 +241,12 @@ class Processes:
     """All processes of a run. A context manager: on leaving it, no process is left.
 
     Attributes:
-        say: tells people what is being done about a process that does not end.
+        log: prints a line for people, such as that a process did not end.
         hurry: whether the user has asked again; deadlines are then short.
         start_program: starts each process.
     """
 
-    say: Callable[[str], None]
+    log: Callable[[str], None]
     hurry: Callable[[], bool] = lambda: False
     stop_deadline: float = STOP_DEADLINE
     start_program: Start = start_program
@@ -302,7 +302,7 @@ class Processes:
             )
             if time.monotonic() - began > limit:
                 for node in waiting:
-                    self.say(f'{node.name} did not end {limit:g} s after SIGINT: killing it')
+                    self.log(f'{node.name} did not end {limit:g} s after SIGINT: killing it')
                 self.kill(waiting)
                 return
             time.sleep(_POLL)

@@ -102,7 +102,7 @@ def supervise(
     while True:
         poll()
         if interrupts.count:
-            processes.say('stopping: nodes end their slice and save (Ctrl-C again to hurry)')
+            processes.log('stopping: nodes end their slice and save (Ctrl-C again to hurry)')
             processes.stop()
             return _after_stop(processes)
         running = processes.running()
@@ -125,7 +125,7 @@ def supervise(
 def _stop_all(processes: Processes, reason: str) -> str:
     if left := processes.running():
         names = ', '.join(node.name for node in left)
-        processes.say(f'{reason}: stopping {names}')
+        processes.log(f'{reason}: stopping {names}')
     processes.stop()
     return reason
 

@@ -53,8 +53,8 @@ class Display(ABC):
             self._live.update(self._render(), refresh=True)
             self._live.stop()
 
-    def say(self, text: str, style: str = '') -> None:
-        """Show a line above the display, to stay."""
+    def log(self, text: str, style: str = '') -> None:
+        """Print a line above the display; it stays there."""
         self._console.print(Text(text, style=style), soft_wrap=True)
         self._stream.flush()
 

@@ -89,13 +89,13 @@ class Progress(Display):
         if result.purpose == 'random':
             self._random.append(result)
             if len(self._random) == self._settings.evaluate_episodes:
-                self.say(f'random policy: {self._of(self._random)}', 'dim')
+                self.log(f'random policy: {self._of(self._random)}', 'dim')
         elif result.purpose == 'evaluation':
             if self._evaluation and self._evaluation[0].version != result.version:
                 self._evaluation = []
             self._evaluation.append(result)
             if len(self._evaluation) == self._settings.evaluate_episodes:
-                self.say(f'after {result.step} steps: {self._of(self._evaluation)}')
+                self.log(f'after {result.step} steps: {self._of(self._evaluation)}')
 
     @property
     def steps(self) -> int:
@@ -146,7 +146,7 @@ class Progress(Display):
 
     def _plain(self) -> None:
         facts = [f'{name} {text}' for name, text in self._facts() if name != 'evaluation']
-        self.say(', '.join(([self._note] if self._note else []) + facts))
+        self.log(', '.join(([self._note] if self._note else []) + facts))
 
     def _render(self) -> RenderableType:
         table = Table.grid(padding=(0, 2))

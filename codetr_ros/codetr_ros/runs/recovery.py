@@ -135,7 +135,7 @@ class Recovery:
             self._note_version(record)
             if len(record.lengths):
                 if record.source not in self._sources:
-                    raise RecoveryError(f'{record.source!r} told no true rewards')
+                    raise RecoveryError(f'{record.source!r} published no true rewards')
                 self._sources[record.source].label(record)
             if record.part == record.parts - 1 and self._settings.evaluated(record.phase):
                 self._compare(self._settings.steps_after(record.phase), record.version)
