@@ -22,10 +22,10 @@ def bag(tmp_path):
         (['--deadline', '-1'], '--deadline -1 must be from 0 to 86400'),
         (
             ['--to', 'nobody'],
-            '--to nobody needs --pace recorded or --rate: nobody says when to go',
+            '--to nobody needs --pace recorded or --rate: no node sets the pace',
         ),
         (['--to', 'nobody', 'reward'], '--to nobody reward: either nobody, or nodes'),
-        (['--namespace', 'play'], "--namespace 'play' must be as ROS has them: /name"),
+        (['--namespace', 'play'], "--namespace 'play' must be a ROS namespace: /name"),
         (['--namespace', '/1st'], "--namespace '/1st' must be"),
         (['--to', 'evaluate'], 'an evaluator follows a learner: play to the learner too'),
         (['--run', 'another'], "holds 0 runs 'another' to be played (there are: run)"),

@@ -54,15 +54,15 @@ def test_doctor_counts_what_dead_processes_left_in_shared_memory(tmp_path: Path)
 
     check = doctor.leftovers(tmp_path)
     assert check.status == 'warn'
-    assert '4 files of dead processes' in check.found
-    assert '2.0 MB' in check.found
+    assert '4 files of dead processes' in check.detail
+    assert '2.0 MB' in check.detail
     assert 'shm clean' in check.remedy
 
     import fcntl
 
     with (tmp_path / 'fastrtps_0123456789abcdef_el').open('rb') as alive:
         fcntl.flock(alive, fcntl.LOCK_EX)
-        assert '2 files of dead processes' in doctor.leftovers(tmp_path).found
+        assert '2 files of dead processes' in doctor.leftovers(tmp_path).detail
 
 
 def test_doctor_says_when_shared_memory_is_missing(tmp_path: Path) -> None:

@@ -486,5 +486,5 @@ def test_reward_recovery_without_all_true_rewards_is_said_not_to_be_told(tmp_pat
     stream, late = io.StringIO(), Summary(SETTINGS, 'r', False, Clock())
     progress = Progress(SETTINGS, stream, live=False, clock=Clock())
     train._complete(late, tmp_path, progress, Interrupts())
-    assert "cannot be told to the end: 'sim' published no true rewards" in stream.getvalue()
+    assert "reward recovery is incomplete: 'sim' published no true rewards" in stream.getvalue()
     assert late.build({}).evaluations, 'all else is told'

@@ -27,7 +27,7 @@ def test_the_doctor_names_a_missing_compiler_and_its_remedy(monkeypatch):
     assert doctor.compiler in doctor.CHECKS
     monkeypatch.setenv('CXX', '/nowhere/g++')
     check = doctor.compiler()
-    assert check.status == 'warn' and '/nowhere/g++' in check.found
+    assert check.status == 'warn' and '/nowhere/g++' in check.detail
     assert 'apt install' in check.remedy and 'sac.compile=false' in check.remedy
 
 

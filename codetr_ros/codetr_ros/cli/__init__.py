@@ -4,10 +4,10 @@ import sys
 from collections.abc import Callable, Sequence
 
 USAGE = 2
-"""Exit code for what the user can mend on the command line, as argparse has it."""
+"""Exit code for what the user can correct on the command line, the same as argparse's."""
 FAILED = 1
 INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it: 128 + SIGINT."""
+"""Exit code after Ctrl-C, the same as in shells: 128 + SIGINT."""
 
 HELP = """usage: codetr COMMAND [OPTIONS]
 
@@ -17,10 +17,10 @@ commands:
   train      train on a task: starts all nodes, shows progress, ends with a report
   fit        fit a reward model to bags, without any node
   label      write a bag with a reward model's step rewards added
-  convert    make a bag to fit of ordinary topics, by a mapping file
+  convert    make a bag for `fit` from ordinary topics, by a mapping file
   evaluate   evaluate the policy of a run's newest checkpoint
-  benchmark  many runs under one protocol, and the table that they make
-  bag        what is in a bag, is it sound, make it whole again
+  benchmark  do many runs under one protocol, and make a table of them
+  bag        show, check, recover or play a bag
   tasks      list the tasks that have a name
   doctor     check Python, ROS, discovery, shared memory, torch and MuJoCo
 
@@ -106,7 +106,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     if not given or given[0] in ('-h', '--help', 'help'):
-        # Asked for, it is the output; not asked for, it is the complaint.
+        # The help is the output if it was asked for, and the complaint if it was not.
         print(HELP, end='', file=sys.stdout if given else sys.stderr)
         return 0 if given else USAGE
     if given[0] == '--version':
@@ -122,13 +122,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except BrokenPipeError:
-        # Whoever read our output (`| head`) has gone; nothing to tell anybody. Without this, the
-        # interpreter complains once more when it flushes at exit.
+        # The reader of our output (`| head`) has gone, so there is nobody to report to. Without
+        # this, the interpreter complains once more when it flushes at exit.
         sys.stdout = None
         return FAILED
 
 
 def refuse(text: str) -> int:
-    """Say why a command was not carried out; the exit code for it."""
+    """Print why a command was refused; returns the exit code."""
     print(f'codetr: {text}', file=sys.stderr)
     return USAGE

@@ -1,4 +1,4 @@
-"""`codetr bag`: what is in a bag, is it sound, and make it whole again."""
+"""`codetr bag`: show, check, recover and play bags."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -7,13 +7,13 @@ from codetr_ros.cli import USAGE, refuse
 
 HELP = """usage: codetr bag COMMAND BAG [OPTIONS]
 
-Bags: folders of MCAP or SQLite files, or one such file, by our recorder, `ros2 bag record` or
-others. No ROS is needed.
+A bag is a folder of MCAP or SQLite files, or one such file, written by our recorder,
+`ros2 bag record` or others. Only `play` needs ROS.
 
 commands:
-  info       what is in it: runs, episodes, segments, scores, topics, files
-  verify     is it sound? every gap, duplicate, damaged chunk, missing score, by its place
-  recover    make a whole bag of what can be read of a damaged or unfinished one
+  info       show what is in it: runs, episodes, segments, scores, topics, files
+  verify     list every gap, duplicate, damaged chunk and missing score, by its place
+  recover    make a whole bag from what can be read of a damaged or unfinished one
   play       publish it again, for a reward node or a learner to train from (needs ROS)
 
 `codetr bag COMMAND --help` explains the options of a command.
@@ -53,7 +53,7 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Carry out one of the commands; the exit code."""
+    """Carry out one of the commands; returns the exit code."""
     if not arguments:
         print(HELP, end='', file=sys.stderr)
         return USAGE

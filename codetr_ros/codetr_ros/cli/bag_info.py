@@ -17,7 +17,7 @@ from codetr_ros.runs import folder as run_folder
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Say what is in a bag. It is read from end to end; damage is counted and read past."""
+    """Show what is in a bag. It is read from end to end; damage is counted and skipped."""
 
     bag: Annotated[
         Path,
@@ -28,7 +28,7 @@ class Arguments:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Read and print; the exit code."""
+    """Read and print; returns the exit code."""
     given = tyro.cli(
         Arguments, prog='codetr bag info', args=arguments, config=(tyro.conf.FlagCreatePairsOff,)
     )
@@ -36,28 +36,28 @@ def main(arguments: Sequence[str]) -> int:
     from codetr_ros.bags.info import survey
 
     try:
-        found = survey(run_folder.bag_of(given.bag))
+        contents = survey(run_folder.bag_of(given.bag))
     except BagError as error:
         return refuse(str(error))
     if given.json:
-        print(json.dumps(found, indent=2, allow_nan=False))
+        print(json.dumps(contents, indent=2, allow_nan=False))
     else:
-        show(found, Console(markup=False))  # names in a bag may look like it
+        show(contents, Console(markup=False))  # names in a bag may look like markup
     return 0
 
 
-def show(found: Mapping[str, Any], console: Console) -> None:
-    """Print what `survey` found."""
-    console.print(_bag(found))
-    for run in found['runs']:
+def show(contents: Mapping[str, Any], console: Console) -> None:
+    """Print the contents that `survey` returns."""
+    console.print(_bag(contents))
+    for run in contents['runs']:
         console.print()
         console.print(_run(run))
     console.print()
-    console.print(_topics(found['topics']))
-    if found['faults']:
+    console.print(_topics(contents['topics']))
+    if contents['faults']:
         console.print(
-            f'\n{found["faults"]} faults were read past: `codetr bag verify {found["bag"]}` names '
-            'them',
+            f'\n{contents["faults"]} faults were skipped: `codetr bag verify {contents["bag"]}` '
+            'lists them',
             style='yellow',
             highlight=False,
         )
@@ -70,12 +70,12 @@ def _pairs() -> Table:
     return table
 
 
-def _bag(found: Mapping[str, Any]) -> Table:
+def _bag(contents: Mapping[str, Any]) -> Table:
     table = _pairs()
-    table.add_row('bag', found['bag'])
-    for file in found['files']:
+    table.add_row('bag', contents['bag'])
+    for file in contents['files']:
         table.add_row('file', f'{file["name"]}, {file["bytes"] / 1e6:.2f} MB')
-    first, last = found['first_ns'], found['last_ns']
+    first, last = contents['first_ns'], contents['last_ns']
     if first is not None:
         began = datetime.fromtimestamp(first / 1e9, timezone.utc)
         table.add_row('recorded', f'{began:%Y-%m-%d %H:%M:%S} UTC, {(last - first) / 1e9:.1f} s')
@@ -109,12 +109,12 @@ def _run(run: Mapping[str, Any]) -> Table:
 
 
 def _span(values: Mapping[str, float]) -> str:
-    wrong = values.get('not_finite', 0)
-    said = f'{wrong} not finite' if wrong else ''
+    count = values.get('not_finite', 0)
+    wrong = f'{count} not finite' if count else ''
     if not values['count']:
-        return said or 'none'
+        return wrong or 'none'
     text = f'{values["min"]:.6g} to {values["max"]:.6g}, mean {values["mean"]:.6g}'
-    return f'{text}; {said}' if said else text
+    return f'{text}; {wrong}' if wrong else text
 
 
 def _whole_span(values: Mapping[str, float]) -> str:

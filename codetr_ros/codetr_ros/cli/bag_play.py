@@ -16,18 +16,19 @@ DEFAULT_NAMESPACE = '/play'
 _NAMESPACE = re.compile(r'/|(/[A-Za-z_][A-Za-z0-9_]*)+')
 
 
-def _option(said: str, metavar: str | None = None) -> object:
-    return tyro.conf.arg(help=said, metavar=metavar)
+def _option(text: str, metavar: str | None = None) -> object:
+    return tyro.conf.arg(help=text, metavar=metavar)
 
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Publish a recorded run again, for a reward node or a learner to train from, or to be looked
-    at. The nodes that it is played to are started by you, in the namespace:
+    """Publish a recorded run again, for a reward node or a learner to train from, or to look at.
+
+    You start the nodes that it is played to, in the namespace:
 
         ros2 run reward_node reward --ros-args -r __ns:=/play -p folder:=/tmp/played
 
-    All other roles of the run are played. It ends when everything has been learnt from.
+    All other roles of the run are played. Playing ends when the nodes have learnt from everything.
     """
 
     bag: Annotated[
@@ -37,24 +38,24 @@ class Arguments:
     ]
     to: Annotated[
         tuple[Literal['reward', 'learner', 'evaluate', 'nobody'], ...],
-        _option('nodes that are there themselves; nobody: play to whoever listens'),
+        _option('nodes that you run; nobody: play without waiting for any node'),
     ] = ('reward',)
     pace: Annotated[
         Literal['commits', 'recorded'],
         _option('a phase as soon as the one before has been learnt from, or as it was recorded'),
     ] = 'commits'
     rate: Annotated[
-        float | None, _option('times as fast as it was recorded; implies --pace recorded', 'R')
+        float | None, _option('speed, in multiples of real time; implies --pace recorded', 'R')
     ] = None
-    namespace: Annotated[str, _option('where to publish')] = DEFAULT_NAMESPACE
-    run: Annotated[str | None, _option('which run, where the bag holds several', 'ID')] = None
+    namespace: Annotated[str, _option('the namespace to publish in')] = DEFAULT_NAMESPACE
+    run: Annotated[str | None, _option('run to play, where the bag holds several', 'ID')] = None
     deadline: Annotated[
         float, _option('seconds to wait for nodes that are missing or silent; 0: for ever', 'S')
     ] = 60.0
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Play a bag; the exit code."""
+    """Play a bag; returns the exit code."""
     given = tyro.cli(
         Arguments, prog='codetr bag play', args=arguments, config=(tyro.conf.FlagCreatePairsOff,)
     )
@@ -66,7 +67,7 @@ def main(arguments: Sequence[str]) -> int:
         return refuse(f'--deadline {given.deadline:g} must be from 0 to 86400')
     if not _NAMESPACE.fullmatch(given.namespace):
         return refuse(
-            f'--namespace {given.namespace!r} must be as ROS has them: /name, of letters, digits '
+            f'--namespace {given.namespace!r} must be a ROS namespace: /name, of letters, digits '
             'and _, not beginning with a digit'
         )
     if live != given.to and live:
@@ -74,7 +75,7 @@ def main(arguments: Sequence[str]) -> int:
     if 'evaluate' in live and 'learner' not in live:
         return refuse('--to evaluate: an evaluator follows a learner: play to the learner too')
     if not live and not recorded_pace:
-        return refuse('--to nobody needs --pace recorded or --rate: nobody says when to go on')
+        return refuse('--to nobody needs --pace recorded or --rate: no node sets the pace')
 
     from codetr_ros.bags.errors import BagError
     from codetr_ros.bags.playback import Pace, PlayError, items, recorded_run
@@ -89,8 +90,8 @@ def main(arguments: Sequence[str]) -> int:
         from codetr_ros.ros import player
     except ImportError as error:
         return refuse(
-            f'playing needs ROS, which cannot be imported ({error}): `codetr doctor` says what is '
-            'missing; `codetr fit` learns from bags without it'
+            f'playing needs ROS, which cannot be imported ({error}): `codetr doctor` names what '
+            'is missing; `codetr fit` learns from bags without it'
         )
     for variable, value in middleware.DEFAULTS.items():
         os.environ.setdefault(variable, value)

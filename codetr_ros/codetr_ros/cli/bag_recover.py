@@ -1,4 +1,4 @@
-"""`codetr bag recover`: make a whole bag of what can be read."""
+"""`codetr bag recover`: make a whole bag from what can be read."""
 
 import dataclasses
 import json
@@ -18,11 +18,11 @@ SHOWN = 20
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Make a whole bag (index, metadata) of what can be read of a damaged or unfinished one.
+    """Make a whole bag (index, metadata) from what can be read of a damaged or unfinished one.
 
-    Every message that can be read is kept byte for byte, in order; what was lost is said. The old
+    Every message that can be read is kept byte for byte, in order; every loss is printed. The old
     bag is not touched. Exit code 0: the new bag is sound, 1: something within it is missing, or
-    the disk does not give all of the old one, 2: nothing could be done.
+    the disk cannot read all of the old one, 2: nothing could be recovered.
     """
 
     bag: Annotated[
@@ -35,7 +35,7 @@ class Arguments:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Recover and print; the exit code."""
+    """Recover and print; returns the exit code."""
     given = tyro.cli(
         Arguments,
         prog='codetr bag recover',
@@ -46,46 +46,46 @@ def main(arguments: Sequence[str]) -> int:
     from codetr_ros.bags.recover import recover
 
     try:
-        found = recover(run_folder.bag_of(given.bag), given.out)
+        recovered = recover(run_folder.bag_of(given.bag), given.out)
     except BagError as error:
         return refuse(str(error))
     if given.json:
-        print(json.dumps(found.report(), indent=2, allow_nan=False))
+        print(json.dumps(recovered.report(), indent=2, allow_nan=False))
     else:
         # names in a bag may look like markup
-        show(found.report(), Console(soft_wrap=True, markup=False))
-    return 0 if found.whole else FAILED
+        show(recovered.report(), Console(soft_wrap=True, markup=False))
+    return 0 if recovered.whole else FAILED
 
 
 def show(report: Mapping[str, Any], console: Console) -> None:
     """Print what became of the bag."""
 
-    def say(text: str) -> None:
+    def show_line(text: str) -> None:
         console.print(text, highlight=False)
 
     for loss in report['losses'][:SHOWN]:
         lost = f' ({loss["bytes"]} bytes lost)' if loss['bytes'] else ''
-        say(f'{loss["place"]}: {loss["text"]}{lost}')
+        show_line(f'{loss["place"]}: {loss["text"]}{lost}')
     if report['faults'] > SHOWN:
-        say(f'{report["faults"] - SHOWN} more')
+        show_line(f'{report["faults"] - SHOWN} more')
     verdict = report['verdict']
     for finding in verdict['findings'][:SHOWN]:
-        say(f'in the new bag: {finding["kind"]}: {finding["text"]}')
+        show_line(f'in the new bag: {finding["kind"]}: {finding["text"]}')
     if (more := sum(verdict['found'].values()) - SHOWN) > 0:
-        say(f'{more} more in the new bag: `codetr bag verify {report["new"]}`')
+        show_line(f'{more} more in the new bag: `codetr bag verify {report["new"]}`')
     for remark in verdict['remarks']:
-        say(f'note: {remark}')
+        show_line(f'note: {remark}')
     for run in verdict['runs']:
         if run['phases_committed']:
             whole = run['phases_whole']
             upto = f'whole up to phase {whole - 1}' if whole else 'no phase is whole'
-            say(
+            show_line(
                 f'run {run["run_id"]!r} in {run["namespace"]}: {upto}, '
                 f'{run["phases_committed"]} phases were committed'
             )
     unread = report['unread']
-    say(
+    show_line(
         f'{report["new"]}: {report["messages"]} messages, {report["bytes"]} bytes kept; '
         f'{report["bytes_lost"]} bytes of {report["old"]} could not be read'
-        + (f', and the disk gives nothing in {unread} places' if unread else '')
+        + (f', and the disk cannot be read in {unread} places' if unread else '')
     )

@@ -18,9 +18,9 @@ from codetr_ros.runs import folder as run_folder
 class Arguments:
     """Compare everything in a bag that can be compared. Exit code 0: sound, 1: damaged, 2: no bag.
 
-    Named are chunks and files that are damaged or cut off, messages that are missing or come
-    twice, numbers that are not finite, segments without their score, commits that name what is not
-    there, runs that are mixed, indexes and metadata that say what is not so.
+    It reports damaged or cut off chunks and files, messages that are missing or come twice,
+    numbers that are not finite, segments without their score, commits of missing records, mixed
+    runs, and indexes and metadata that are wrong.
     """
 
     bag: Annotated[
@@ -30,12 +30,12 @@ class Arguments:
     ]
     json: Annotated[bool, tyro.conf.arg(help='print JSON', name='json')] = False
     limit: Annotated[
-        int, tyro.conf.arg(metavar='N', help='findings of each kind that are printed')
+        int, tyro.conf.arg(metavar='N', help='the most findings of each kind to print')
     ] = 20
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Read, compare and print; the exit code."""
+    """Read, compare and print; returns the exit code."""
     given = tyro.cli(
         Arguments, prog='codetr bag verify', args=arguments, config=(tyro.conf.FlagCreatePairsOff,)
     )
@@ -55,7 +55,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def show(report: Mapping[str, Any], limit: int, console: Console) -> None:
-    """Print what `verify` found."""
+    """Print the findings of `verify`."""
     shown: Counter[str] = Counter()
     for finding in report['findings']:
         shown[finding['kind']] += 1
@@ -63,7 +63,7 @@ def show(report: Mapping[str, Any], limit: int, console: Console) -> None:
             text = f'{finding["kind"]}: {finding["place"]}: {finding["text"]}'
             console.print(text, highlight=False)
     for kind, count in report['found'].items():
-        if (more := count - min(shown[kind], limit)) > 0:  # of very many not all are named
+        if (more := count - min(shown[kind], limit)) > 0:  # the report lists a limited number
             console.print(f'{kind}: {more} more', highlight=False)
     for remark in report['remarks']:
         console.print(f'note: {remark}', highlight=False)
@@ -79,8 +79,8 @@ def show(report: Mapping[str, Any], limit: int, console: Console) -> None:
         kinds = ', '.join(f'{count} {kind}' for kind, count in report['found'].items())
         console.print(
             f'{report["bag"]}: damaged: {total} findings ({kinds}) in {report["messages"]} '
-            f'messages. `codetr bag recover {report["bag"]} --out NEW` makes a whole bag of what '
-            'can be read',
+            f'messages. `codetr bag recover {report["bag"]} --out NEW` makes a whole bag from '
+            'what can be read',
             style='red',
             highlight=False,
         )

@@ -1,4 +1,4 @@
-"""`codetr benchmark`: many runs under one protocol, and the table that they make."""
+"""`codetr benchmark`: do many runs under one protocol, and make a table of them."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -16,8 +16,8 @@ class Run:
     """Run every cell of a benchmark that is not finished yet.
 
     A cell is one run in process, of one method, task, composite reward, delay and seed: the spec
-    lists them, and all combinations are run. Stopped or killed, the same command goes on where it
-    was: finished cells are kept, unfinished ones begin again. Exit code 1: a cell has failed.
+    lists them, and all combinations are run. After a stop or a crash, the same command goes on:
+    finished cells are kept, unfinished ones begin again. Exit code 1: a cell has failed.
     """
 
     spec: Annotated[
@@ -33,15 +33,15 @@ class Run:
     workers: Annotated[
         int,
         tyro.conf.arg(
-            metavar='N', help='cells at a time, each with as many threads as its settings say'
+            metavar='N', help='cells at a time, each with the number of threads in its settings'
         ),
     ] = 1
     ray: Annotated[
         str | None,
         tyro.conf.arg(
             metavar='ADDRESS',
-            help='run the cells on a Ray cluster, whose nodes all see DIR, instead of in '
-            '--workers; `local` starts one on this machine',
+            help='run the cells on a Ray cluster instead of with --workers; all of its nodes must '
+            'see DIR; `local` starts one on this machine',
         ),
     ] = None
     retry_failed: Annotated[
@@ -51,7 +51,7 @@ class Run:
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """Make a report of one or several benchmarks: tables, pictures, what has failed.
+    """Make a report of one or several benchmarks: tables, pictures and failures.
 
     Writes index.html, table.md, table.csv, cells.csv and pictures.
     """
@@ -62,12 +62,12 @@ class Report:
         tyro.conf.arg(metavar='DIR [DIR ...]', help="the benchmarks' folders"),
     ]
     out: Annotated[
-        str | None, tyro.conf.arg(metavar='DIR', help='where it goes; by default DIR/report')
+        str | None, tyro.conf.arg(metavar='DIR', help='report folder; by default DIR/report')
     ] = None
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Do what the command line says; the exit code."""
+    """Carry out the command line; returns the exit code."""
     kinds = (
         Annotated[Run, tyro.conf.subcommand('run')]
         | Annotated[Report, tyro.conf.subcommand('report')]
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str]) -> int:
     given: Run | Report = tyro.cli(
         kinds,
         prog='codetr benchmark',
-        description='Many runs under one protocol, and the table that they make.',
+        description='Do many runs under one protocol, and make a table of them.',
         args=arguments,
     )
     return _run(given) if isinstance(given, Run) else _report(given)
@@ -118,11 +118,11 @@ def _report(given: Report) -> int:
     if not given.folders:
         return refuse('benchmark report: give the folder of a benchmark')
     try:
-        folder, said = report.write(
+        folder, text = report.write(
             [Path(name) for name in given.folders], Path(given.out) if given.out else None
         )
     except (spec.BenchmarkError, TaskError) as error:
         return refuse(str(error))
-    print(said)
+    print(text)
     print(f'report: {folder / "index.html"}')
     return 0

@@ -1,4 +1,4 @@
-"""`codetr convert`: a bag that can be fitted, of a bag with ordinary topics."""
+"""`codetr convert`: make a bag for `codetr fit` from a bag with ordinary topics."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -17,10 +17,10 @@ from codetr_ros.records import RecordError
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Make Transitions and CompositeReward messages of ordinary topics, by a mapping file.
+    """Make Transitions and CompositeReward messages from ordinary topics, by a mapping file.
 
-    The mapping says which fields of which topics are observation, action and score, when a step is
-    taken and where an episode ends: docs/other-peoples-data.md. No ROS is needed.
+    The mapping defines which fields of which topics are observation, action and score, when a step
+    is taken and where an episode ends: docs/other-peoples-data.md. No ROS is needed.
     """
 
     bag: Annotated[
@@ -31,7 +31,7 @@ class Arguments:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Convert and say what came of it; the exit code."""
+    """Convert and print a summary; returns the exit code."""
     given = tyro.cli(Arguments, prog='codetr convert', args=arguments)
     from codetr_ros.bags.reader import Bag
     from codetr_ros.offline import mapping

@@ -1,4 +1,4 @@
-"""`codetr doctor`: is everything there that a run needs? A line for each check, with a remedy."""
+"""`codetr doctor`: check that everything a run needs is there, with a line for each check."""
 
 import dataclasses
 import importlib
@@ -25,27 +25,27 @@ _INSTALL = 'run `make` in the project, or build the colcon workspace and source 
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """What was found.
+    """The result of one check.
 
     Attributes:
-        name: what was looked at.
+        name: the thing that was checked.
         status: fail: nothing will work over topics; warn: something may not.
-        found: what it is like.
-        remedy: what to do about it; empty where nothing is to be done.
+        detail: the version, place or value that was observed.
+        remedy: what to do about it; empty where nothing has to be done.
     """
 
     name: str
     status: Literal['ok', 'warn', 'fail']
-    found: str
+    detail: str
     remedy: str = ''
 
 
 def python() -> Check:
-    """Versions that ROS 2 Jazzy exists for."""
-    found = f'{platform.python_version()} ({sys.executable})'
+    """Whether ROS 2 Jazzy exists for this version of Python."""
+    detail = f'{platform.python_version()} ({sys.executable})'
     if not (3, 10) <= sys.version_info[:2] <= (3, 13):
-        return Check('Python', 'fail', found, 'use Python 3.10 to 3.13')
-    return Check('Python', 'ok', found)
+        return Check('Python', 'fail', detail, 'use Python 3.10 to 3.13')
+    return Check('Python', 'ok', detail)
 
 
 def ros() -> Check:
@@ -54,26 +54,29 @@ def ros() -> Check:
         importlib.import_module('rclpy')
     except ImportError as error:
         return Check('ROS', 'fail', f'rclpy cannot be imported: {error}', _INSTALL)
-    found = f'rclpy {version_of("ros-jazzy-rclpy", "rclpy") or "of unknown version"}'
+    detail = f'rclpy {version_of("ros-jazzy-rclpy", "rclpy") or "of unknown version"}'
     distribution = os.environ.get('ROS_DISTRO', 'jazzy')
     if distribution != 'jazzy':
         return Check(
-            'ROS', 'warn', f'{found}, ROS_DISTRO={distribution}', 'this is tested with ROS 2 Jazzy'
+            'ROS',
+            'warn',
+            f'{detail}, ROS_DISTRO={distribution}',
+            'this is tested with ROS 2 Jazzy',
         )
-    return Check('ROS', 'ok', found)
+    return Check('ROS', 'ok', detail)
 
 
 def middleware() -> Check:
-    """Which RMW carries the topics."""
+    """The RMW that carries the topics."""
     try:
         utilities = importlib.import_module('rclpy.utilities')
-        found = str(utilities.get_rmw_implementation_identifier())
-    except Exception as error:  # noqa: BLE001  rclpy raises what its C library says
+        name = str(utilities.get_rmw_implementation_identifier())
+    except Exception as error:  # noqa: BLE001  rclpy raises the errors of its C library
         return Check('RMW', 'fail', f'{type(error).__name__}: {error}', _INSTALL)
-    if found != 'rmw_fastrtps_cpp':
-        remedy = 'everything here is measured with it: unset RMW_IMPLEMENTATION'
-        return Check('RMW', 'warn', f'{found}, not rmw_fastrtps_cpp', remedy)
-    return Check('RMW', 'ok', found)
+    if name != 'rmw_fastrtps_cpp':
+        remedy = 'all measurements here are with rmw_fastrtps_cpp: unset RMW_IMPLEMENTATION'
+        return Check('RMW', 'warn', f'{name}, not rmw_fastrtps_cpp', remedy)
+    return Check('RMW', 'ok', name)
 
 
 def messages() -> Check:
@@ -98,44 +101,46 @@ def executables() -> Check:
     from codetr_ros.processes import launcher
 
     try:
-        found = [launcher.executable(role) for role in ROLES]
+        paths = [launcher.executable(role) for role in ROLES]
     except launcher.LaunchError as error:
         return Check('nodes', 'fail', str(error).split(':')[0], _INSTALL)
-    return Check('nodes', 'ok', f'{len(found)} executables in {found[0].parents[1]}')
+    return Check('nodes', 'ok', f'{len(paths)} executables in {paths[0].parents[1]}')
 
 
 def discovery(environ: Mapping[str, str] = os.environ) -> Check:
     """How far nodes look for each other."""
     reach = environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE')
     domain = environ.get('ROS_DOMAIN_ID', '0')
-    found = f'ROS_DOMAIN_ID={domain}, ROS_AUTOMATIC_DISCOVERY_RANGE={reach or "not set"}'
+    detail = f'ROS_DOMAIN_ID={domain}, ROS_AUTOMATIC_DISCOVERY_RANGE={reach or "not set"}'
     if not re.fullmatch(r'\d+', domain) or int(domain) > 101:
-        return Check('discovery', 'fail', found, 'ROS_DOMAIN_ID must be a number from 0 to 101')
+        return Check('discovery', 'fail', detail, 'ROS_DOMAIN_ID must be a number from 0 to 101')
     if reach is None:
-        return Check('discovery', 'ok', f'{found} (`codetr train` sets LOCALHOST: this host only)')
+        return Check(
+            'discovery', 'ok', f'{detail} (`codetr train` sets LOCALHOST: this host only)'
+        )
     if reach not in ('LOCALHOST', 'SUBNET', 'OFF', 'SYSTEM_DEFAULT'):
         remedy = 'ROS_AUTOMATIC_DISCOVERY_RANGE must be LOCALHOST, SUBNET, OFF or SYSTEM_DEFAULT'
-        return Check('discovery', 'fail', found, remedy)
+        return Check('discovery', 'fail', detail, remedy)
     if reach == 'OFF':
         remedy = 'nodes will not find each other: unset ROS_AUTOMATIC_DISCOVERY_RANGE'
-        return Check('discovery', 'fail', found, remedy)
+        return Check('discovery', 'fail', detail, remedy)
     if reach != 'LOCALHOST':
-        return Check('discovery', 'warn', found, 'other hosts of the network can join the run')
-    return Check('discovery', 'ok', found)
+        return Check('discovery', 'warn', detail, 'other hosts of the network can join the run')
+    return Check('discovery', 'ok', detail)
 
 
 def _in_use(lock: Path) -> bool:
-    """Whether a process holds the lock file of a Fast DDS segment: it does as long as it lives."""
+    """Whether a process holds the lock file of a Fast DDS segment, as it does while it lives."""
     try:
         with lock.open('rb') as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:  # locked, gone in this moment, or somebody else's: not ours to call dead
+    except OSError:  # locked, just removed, or of another user: perhaps not dead
         return True
     return False
 
 
 def leftovers(folder: Path = SHARED_MEMORY) -> Check:
-    """What processes that were killed have left in shared memory."""
+    """Files that killed processes have left in shared memory."""
     files: list[Path] = []
     locks = [p for p in folder.glob('fastrtps_*') if p.name.endswith(('_el', '_sl'))]
     for lock in locks:
@@ -146,9 +151,9 @@ def leftovers(folder: Path = SHARED_MEMORY) -> Check:
         return Check('leftovers', 'ok', f'none of dead processes in {folder}')
     tool = Path(sys.prefix) / 'tools' / 'fastdds' / 'fastdds.py'
     command = f'{sys.executable} {tool} shm clean' if tool.is_file() else 'fastdds shm clean'
-    found = f'{len(sizes)} files of dead processes in {folder}, {sum(sizes) / 1e6:.1f} MB'
+    detail = f'{len(sizes)} files of dead processes in {folder}, {sum(sizes) / 1e6:.1f} MB'
     return Check(
-        'leftovers', 'warn', found, f'harmless but for the memory; remove with: {command}'
+        'leftovers', 'warn', detail, f'harmless except for the memory; remove with: {command}'
     )
 
 
@@ -174,10 +179,10 @@ def torch() -> list[Check]:
     except ImportError as error:
         return [Check('torch', 'fail', f'cannot be imported: {error}', _INSTALL)]
     threads = os.environ.get('OMP_NUM_THREADS')
-    said = f', OMP_NUM_THREADS={threads}' if threads else ''
+    variable = f', OMP_NUM_THREADS={threads}' if threads else ''
     threads_now, cores = module.get_num_threads(), processors.count()
-    found = f'{module.__version__}, {threads_now} threads on {cores} cores{said}'
-    checks = [Check('torch', 'ok', f'{found} (`codetr train` sets its own: --threads)')]
+    detail = f'{module.__version__}, {threads_now} threads on {cores} cores{variable}'
+    checks = [Check('torch', 'ok', f'{detail} (`codetr train` sets its own: --threads)')]
     if module.cuda.is_available():
         name = module.cuda.get_device_name()
         checks.append(Check('GPU', 'ok', f'{name}: device=cuda, reward_device=cuda'))
@@ -187,30 +192,32 @@ def torch() -> list[Check]:
 
 
 def compiler() -> Check:
-    """What `sac.compile` needs."""
+    """The C++ compiler that `sac.compile` needs."""
     lacking = compilation.missing()
     if lacking:
         remedy = f'{compilation.REMEDY}; without, set sac.compile=false'
         return Check('C++ compiler', 'warn', lacking, remedy)
-    found = f'{compilation.command()}, compiled functions are kept in {compilation.cache_folder()}'
-    return Check('C++ compiler', 'ok', found)
+    detail = (
+        f'{compilation.command()}, compiled functions are kept in {compilation.cache_folder()}'
+    )
+    return Check('C++ compiler', 'ok', detail)
 
 
 def simulators() -> Check:
-    """MuJoCo and what is built on it."""
+    """MuJoCo and the packages built on it."""
     versions = {name: version_of(name) for name in ('mujoco', 'gymnasium', 'dm-control')}
-    found = ', '.join(f'{name} {version or "missing"}' for name, version in versions.items())
+    detail = ', '.join(f'{name} {version or "missing"}' for name, version in versions.items())
     try:
         importlib.import_module('mujoco')
     except ImportError as error:
         return Check('MuJoCo', 'fail', f'cannot be imported: {error}', _INSTALL)
     if not versions['gymnasium']:
-        return Check('MuJoCo', 'fail', found, _INSTALL)
+        return Check('MuJoCo', 'fail', detail, _INSTALL)
     if not versions['dm-control']:
-        return Check('MuJoCo', 'warn', found, 'DM Control tasks need dm_control: install it')
+        return Check('MuJoCo', 'warn', detail, 'DM Control tasks need dm_control: install it')
     if versions['mujoco'] and int(versions['mujoco'].split('.')[0]) >= 4:
-        return Check('MuJoCo', 'warn', found, 'dm_control breaks with mujoco 4: install mujoco<4')
-    return Check('MuJoCo', 'ok', found)
+        return Check('MuJoCo', 'warn', detail, 'dm_control breaks with mujoco 4: install mujoco<4')
+    return Check('MuJoCo', 'ok', detail)
 
 
 CHECKS: tuple[Callable[[], Check | list[Check]], ...] = (
@@ -230,7 +237,7 @@ CHECKS: tuple[Callable[[], Check | list[Check]], ...] = (
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Check that everything is there that a run needs; the exit code is 1 if anything fails."""
+    """Check that everything a run needs is there; the exit code is 1 if anything fails."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -247,7 +254,7 @@ def main(arguments: Sequence[str]) -> int:
         result = look()
         for check in result if isinstance(result, list) else [result]:
             line = Text(f'{check.status:4}  ', style=colours[check.status])
-            line.append(f'{check.name}: {check.found}', style='default')
+            line.append(f'{check.name}: {check.detail}', style='default')
             console.print(line, soft_wrap=True)
             if check.remedy:
                 console.print(Text(f'      -> {check.remedy}'), soft_wrap=True)

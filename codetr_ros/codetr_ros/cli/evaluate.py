@@ -1,4 +1,4 @@
-"""`codetr evaluate`: how good is the policy of a run's newest checkpoint?"""
+"""`codetr evaluate`: measure the policy of a run's newest checkpoint."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -29,20 +29,20 @@ class Arguments:
     ]
     episodes: Annotated[
         int | None,
-        tyro.conf.arg(metavar='N', help="how many; as the run's evaluations if not given"),
+        tyro.conf.arg(metavar='N', help='number of episodes; by default as in the run'),
     ] = None
     seed: Annotated[
-        int | None, tyro.conf.arg(metavar='K', help="of the start states; the run's if not given")
+        int | None, tyro.conf.arg(metavar='K', help="seed of start states; by default the run's")
     ] = None
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Evaluate and print; the exit code."""
+    """Evaluate and print; returns the exit code."""
     given = tyro.cli(Arguments, prog='codetr evaluate', args=arguments)
     folder = Path(given.run_dir)
     try:
         settings = run_folder.read_settings(folder)
-        # to read a policy needs neither the GPU that it was learnt on nor a compiler
+        # reading a policy needs neither the GPU that it was learnt on nor a compiler
         changes: dict[str, int | str] = {
             'evaluate_every': 1,
             'device': 'cpu',
@@ -81,7 +81,7 @@ def newest_policy(folder: Path, settings: Settings) -> Policy:
     Raises:
         RunFolderError: there is no checkpoint, or none with a policy that has learnt.
         CheckpointError: the checkpoint is damaged.
-        LearnerError: it is of other settings than the run's folder has.
+        LearnerError: its settings differ from those in the run's folder.
     """
     from codetr_ros.learners import registry
     from codetr_ros.policy.actor import weights_bytes
@@ -116,7 +116,7 @@ def newest_policy(folder: Path, settings: Settings) -> Policy:
 
 
 def evaluate(policy: Policy, settings: Settings) -> list[EpisodeResult]:
-    """`settings.evaluate_episodes` episodes of this policy, without noise."""
+    """Run `settings.evaluate_episodes` episodes of this policy, without noise."""
     import torch
 
     from codetr_ros.cores.evaluator import Evaluator
@@ -136,7 +136,7 @@ def evaluate(policy: Policy, settings: Settings) -> list[EpisodeResult]:
 
 
 def table(results: Sequence[EpisodeResult]) -> Table:
-    """Mean and spread of what the episodes earned."""
+    """Mean and spread of the returns, scores and lengths of episodes."""
     shown = Table(box=None, pad_edge=False)
     shown.add_column('')
     for name in ('mean', 'std', 'min', 'max'):

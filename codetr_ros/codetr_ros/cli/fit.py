@@ -1,4 +1,4 @@
-"""`codetr fit`: a reward model from bags, without any node."""
+"""`codetr fit`: fit a reward model to bags, without any node."""
 
 import dataclasses
 import sys
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 DESCRIPTION = """Fit a reward model to bags, without any node and without ROS.
 
 The bags hold Transitions and CompositeReward messages: those of `codetr train`, or anybody's.
-Settings that are not given are those of the first bag's run, where it says what they are, else of
-the preset `quick`. The folder DIR then has a checkpoint that a reward node starts from, a summary
-and a report."""
+Settings that are not given are those of the first bag's run, where the bag holds them, else of the
+preset `quick`. The command writes a checkpoint that a reward node can start from, a summary and a
+report into the folder DIR."""
 
 
 def _own_fields() -> list[tuple[str, Any, Any]]:
-    def field(name: str, kind: Any, default: Any, metavar: str, said: str) -> tuple[str, Any, Any]:
-        return name, Annotated[kind, tyro.conf.arg(metavar=metavar, help=said)], default
+    def field(name: str, kind: Any, default: Any, metavar: str, text: str) -> tuple[str, Any, Any]:
+        return name, Annotated[kind, tyro.conf.arg(metavar=metavar, help=text)], default
 
     bags = Annotated[
         tuple[str, ...],
@@ -58,7 +58,7 @@ def _own_fields() -> list[tuple[str, Any, Any]]:
             '',
             'PATH',
             'go on from this model: folder of a fit, of a run or of a checkpoint; with --schedule '
-            'phases the one that the run started from',
+            'phases, the model that the run started from',
         ),
         (
             'frozen',
@@ -73,7 +73,7 @@ def _own_fields() -> list[tuple[str, Any, Any]]:
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """What the command line says."""
+    """The values of the command line."""
 
     bags: tuple[Path, ...]
     out: Path
@@ -114,7 +114,7 @@ def parse(arguments: Sequence[str], base: Settings) -> Arguments:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Fit as the command line says; the exit code."""
+    """Fit by the values of the command line; returns the exit code."""
     try:
         given = parse(arguments, config.load('quick'))
         run_folder.check(given.out)
@@ -149,8 +149,8 @@ def _epochs(arguments: Sequence[str], given: Arguments) -> int:
     settings = given.settings
     _refuse_unfit(settings)
     longest = min(given.fit.stretch_steps, max(1, settings.memory_steps // 4))
-    found = stretches(index, settings.delay, longest)
-    plan = fitting.plan(found.found, settings, given.fit)
+    data = stretches(index, settings.delay, longest)
+    plan = fitting.plan(data.usable, settings, given.fit)
     sizes = index.observation_size, index.action_size
     method = saved.restore(start, settings, *sizes) if start else None
     folder = results.make_folder(given.out)
@@ -179,7 +179,7 @@ def _epochs(arguments: Sequence[str], given: Arguments) -> int:
     }
     checkpoints.save(folder / run_folder.CHECKPOINTS, 'reward', 0, fitted.method.state(), meta)
     judged = judging.judge(fitted.method, fitted.held_out)
-    summary = results.of_epochs(fitted, index, found, settings, given.fit, judged)
+    summary = results.of_epochs(fitted, index, data, settings, given.fit, judged)
     results.write(folder, summary)
     report.write(folder, summary, judged)
     results.show(summary, folder, console)
@@ -195,7 +195,7 @@ def _line(check: 'Check', fit: FitSettings) -> str:
 
 
 def _index(given: Arguments) -> 'tuple[Index, Console]':
-    """Open the bags and go through them once."""
+    """Open the bags and read them once."""
     from codetr_ros.offline.episodes import Index
     from codetr_ros.offline.sources import open_bags
 
@@ -257,14 +257,14 @@ def _phases(arguments: Sequence[str], given: Arguments) -> int:
         given.frozen,
     )
     seconds = time.perf_counter() - began
-    found = stretches(index, own.delay, given.fit.stretch_steps)
+    data = stretches(index, own.delay, given.fit.stretch_steps)
     judged = None
     if folded.core.method is not None and folded.core.method.target_scale:
-        newest = list(loading.newest(found.found, given.settings.memory_steps))
+        newest = list(loading.newest(data.usable, given.settings.memory_steps))
         sizes = index.observation_size, index.action_size
         loaded = loading.load(index.bags, newest, sizes, own.delay, true_rewards=True)
         judged = judging.judge(folded.core.method, loaded)
-    summary = results.of_phases(folded, index, found, own, given.fit, judged, seconds, live)
+    summary = results.of_phases(folded, index, data, own, given.fit, judged, seconds, live)
     results.write(folder, summary)
     report.write(folder, summary, judged)
     results.show(summary, folder, console)

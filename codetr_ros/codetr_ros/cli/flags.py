@@ -1,8 +1,8 @@
-"""Flags of the command line, made from `config.Settings`: same names, ranges and defaults.
+"""Flags of the command line, made from `config.Settings` with its names, ranges and defaults.
 
-tyro parses what a dataclass describes. The dataclasses are made here from the settings, because
-tyro would run pydantic's checks one group at a time and show its own words for what they refuse;
-so the values are collected first and validated once, by `config.parse`.
+tyro parses the fields of a dataclass. The dataclasses are made here from the settings, because
+tyro would run pydantic's checks one group at a time and replace their messages by its own. So the
+values are collected first and validated once, by `config.parse`.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ def _help(field: FieldInfo) -> str:
 
 def settings_fields(group: BaseModel) -> list[tuple[str, Any, Any]]:
     """Fields for `dataclasses.make_dataclass`: name, annotated type, default from `group`."""
-    found: list[tuple[str, Any, Any]] = []
+    fields: list[tuple[str, Any, Any]] = []
     for name, field in type(group).model_fields.items():
         value = getattr(group, name)
         text = tyro.conf.arg(help=_help(field))
@@ -41,31 +41,31 @@ def settings_fields(group: BaseModel) -> list[tuple[str, Any, Any]]:
             )
             nested.__doc__ = field.description
             default = dataclasses.field(default_factory=nested)
-            found.append((name, Annotated[nested, text], default))
+            fields.append((name, Annotated[nested, text], default))
         else:
-            found.append(
+            fields.append(
                 (name, Annotated[field.annotation, text], dataclasses.field(default=value))
             )
-    return found
+    return fields
 
 
 def chosen_config(arguments: Sequence[str], default: str) -> str:
-    """The value of the last `--config`, which decides the defaults of all other flags.
+    """The value of the last `--config`, which sets the defaults of all other flags.
 
     Raises:
-        SettingsError: `--config` is the last word.
+        SettingsError: `--config` is the last argument.
     """
-    found = default
+    chosen = default
     for i, argument in enumerate(arguments):
         if argument == '--config':
             if i + 1 == len(arguments):
                 raise SettingsError(
                     f'--config needs a value: {", ".join(config.PRESETS)} or a YAML file'
                 )
-            found = arguments[i + 1]
+            chosen = arguments[i + 1]
         elif argument.startswith('--config='):
-            found = argument.removeprefix('--config=')
-    return found
+            chosen = argument.removeprefix('--config=')
+    return chosen
 
 
 def parse(
@@ -90,14 +90,14 @@ def parse(
 
     Raises:
         SettingsError: a value is out of range, or the configuration cannot be read.
-        SystemExit: code 0 after `--help`, 2 for a flag that does not exist or a value of another
+        SystemExit: code 0 after `--help`, 2 for a flag that does not exist or a value of the wrong
             type.
     """
     name = chosen_config(arguments, default)
     base = config.load(name)
-    said = f'{", ".join(config.PRESETS)} or a YAML file: the defaults of all other flags'
+    text = f'{", ".join(config.PRESETS)} or a YAML file: the defaults of all other flags'
     own = [
-        ('config', Annotated[str, tyro.conf.arg(metavar='NAME|FILE', help=said)], name),
+        ('config', Annotated[str, tyro.conf.arg(metavar='NAME|FILE', help=text)], name),
         *more,
     ]
     kind = dataclasses.make_dataclass('Arguments', [*own, *settings_fields(base)], frozen=True)

@@ -1,4 +1,4 @@
-"""`codetr label`: a bag with step rewards added, as a reward model has them."""
+"""`codetr label`: add the step rewards of a reward model to a bag."""
 
 import dataclasses
 import sys
@@ -20,8 +20,8 @@ from codetr_ros.records import RecordError
 class Arguments:
     """Write a bag with the step rewards of all scored segments added, for anybody's use.
 
-    NEW holds every message of BAG byte for byte, and StepRewards messages at its end, on the topic
-    step_rewards beside that of the steps. No ROS is needed.
+    NEW holds every message of BAG byte for byte. StepRewards messages follow at its end, on the
+    topic step_rewards beside that of the steps. No ROS is needed.
     """
 
     bag: Annotated[
@@ -35,19 +35,19 @@ class Arguments:
     ]
     out: Annotated[str, tyro.conf.arg(metavar='NEW', help='folder of the new bag, new or empty')]
     memory_steps: Annotated[
-        int, tyro.conf.arg(metavar='N', help='steps that are held in memory at a time')
+        int, tyro.conf.arg(metavar='N', help='the most steps to hold in memory at a time')
     ] = 1_000_000
     reward_device: Annotated[
         str,
         tyro.conf.arg(
             metavar='DEVICE',
-            help='where the model labels, wherever it has learnt: cpu, cuda, cuda:1, ...',
+            help='device for labelling, wherever the model has learnt: cpu, cuda, cuda:1, ...',
         ),
     ] = 'cpu'
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Label and say what was labelled; the exit code."""
+    """Label and print what was labelled; returns the exit code."""
     given = tyro.cli(Arguments, prog='codetr label', args=arguments)
     if given.memory_steps < 1:
         return refuse(f'--memory-steps {given.memory_steps}: at least 1 step must be held')

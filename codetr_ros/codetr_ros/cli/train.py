@@ -1,4 +1,4 @@
-"""`codetr train`: start everything, show how it goes, end with a summary and a report."""
+"""`codetr train`: start everything, show its progress, end with a summary and a report."""
 
 import dataclasses
 import os
@@ -38,8 +38,8 @@ from codetr_ros.system.files import atomic_write
 DESCRIPTION = """Train on a task.
 
 Starts a simulator, an evaluator, the reward model, the learner and a recorder as ROS 2 nodes in a
-namespace of their own, shows how they do, and ends with a summary, a report and a picture. Ctrl-C
-ends all of it cleanly. Every setting is a flag; --config decides the defaults of all others."""
+namespace of their own, shows their progress, and ends with a summary, a report and a picture.
+Ctrl-C ends all of it cleanly. Every setting is a flag; --config sets their defaults."""
 
 
 @dataclasses.dataclass
@@ -49,11 +49,11 @@ class Outcome:
     reports: Mapping[str, NodeReport]
     interrupted: bool = False
     failure: str | None = None
-    log: Path | None = None  # where the failure is explained
+    log: Path | None = None  # explains the failure
 
 
 def main(arguments: Sequence[str], start: launcher.Start = launcher.start_program) -> int:
-    """Train as the command line says; the exit code.
+    """Train by the values of the command line; returns the exit code.
 
     Args:
         arguments: those of `codetr train`.
@@ -78,7 +78,7 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
             'in_process',
             Annotated[
                 bool,
-                tyro.conf.arg(help='no nodes and no topics: the same run with plain calls'),
+                tyro.conf.arg(help='do the same run with plain calls, without nodes and topics'),
             ],
             False,
         ),
@@ -99,13 +99,13 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
         folder = run_folder.create(Path(extra['out'] or default_out(settings, stamp)))
     except (SettingsError, tasks.TaskError, RunFolderError, LaunchError) as error:
         return refuse(str(error))
-    # Letters first: as a ROS parameter and part of a namespace it must not read as a number.
+    # A letter first: as a ROS parameter and in a namespace it must not read as a number.
     run_id = f'r{stamp.replace("-", "_")}_{secrets.token_hex(2)}'
     return train(settings, run_id, folder, in_process, start)
 
 
 def default_out(settings: Settings, stamp: str) -> str:
-    """The output folder where none is given."""
+    """The output folder that is used if none is given."""
     task = re.sub(r'[^A-Za-z0-9_.-]+', '_', settings.task)
     return f'runs/{task}-{settings.method}-{settings.seed}-{stamp}'
 
@@ -117,13 +117,13 @@ def train(
     in_process: bool,
     start: launcher.Start = launcher.start_program,
 ) -> int:
-    """Run it, and leave everything about it in its folder.
+    """Do a run and write everything about it into its folder.
 
     Args:
         settings: the run's settings.
         run_id: its name: letters, digits and `_`.
-        folder: its folder, made.
-        in_process: without nodes.
+        folder: its folder, which exists.
+        in_process: run without nodes.
         start: starts the nodes.
 
     Returns:
@@ -156,7 +156,7 @@ def train(
             outcome.failure = '; '.join(filter(None, (outcome.failure, str(error))))
     show(built, folder, Console())
     if outcome.failure:
-        say_failure(outcome)
+        show_failure(outcome)
     if outcome.interrupted:
         return INTERRUPTED
     return FAILED if outcome.failure else 0
@@ -170,7 +170,7 @@ def _in_process(
     progress: Progress,
     interrupts: Interrupts,
 ) -> Outcome:
-    # Before torch is imported: the same threads as the nodes have, for the same bits.
+    # Before torch is imported: the threads of the nodes, for the same results bit for bit.
     os.environ.update(launcher.threading_environment(settings))
     from codetr_ros.cores import in_process
 
@@ -182,7 +182,7 @@ def _in_process(
         if interrupts.count:
             raise KeyboardInterrupt
 
-    # A slice may be long: whoever asks twice does not wait for its end.
+    # A slice may be long: a second Ctrl-C does not wait for its end.
     interrupts.raising = True
     try:
         return Outcome(in_process.run(settings, run_id, folder, observe, tick))
@@ -190,7 +190,7 @@ def _in_process(
         progress.log('stopped')
         return Outcome(node_reports.read_all(folder), interrupted=True)
     except Exception as error:  # noqa: BLE001
-        # Whatever it was: what was learnt until now is worth a summary, which names the failure.
+        # The summary keeps what was learnt until now, and names the failure, whatever it is.
         log = folder / run_folder.LOGS / 'in_process.log'
         atomic_write(log, traceback.format_exc())
         reports = node_reports.read_all(folder)
@@ -210,7 +210,7 @@ def _over_topics(
 ) -> Outcome:
     commands = launcher.commands(settings, run_id, folder)
     environment = launcher.environment(settings)
-    # For the watcher, which lives in this process: it must look where the nodes are.
+    # The watcher lives in this process and must look for the nodes where they are.
     os.environ.update(
         {name: v for name, v in environment.items() if name.startswith(('ROS_', 'RMW_'))}
     )
@@ -219,7 +219,7 @@ def _over_topics(
     except ImportError as error:
         return Outcome(
             {},
-            failure=f'ROS cannot be imported ({error}): `codetr doctor` says what is missing; '
+            failure=f'ROS cannot be imported ({error}): `codetr doctor` names what is missing; '
             '--in-process trains without ROS',
         )
     silence = Silence()
@@ -233,7 +233,7 @@ def _over_topics(
     asked = interrupts.again
     with launcher.Processes(progress.log, asked, start_program=start) as processes:
         try:
-            # The watcher first: what the nodes say from their start on is to be heard.
+            # The watcher comes first, so as to receive everything from the nodes' start on.
             with Watcher(receive, f'/run_{run_id}') as watcher:
 
                 def poll() -> None:
@@ -248,7 +248,7 @@ def _over_topics(
                     silence,
                     lambda node: why_it_gave_up(node, folder),
                 )
-                watcher.poll(0.0)  # the last words of the last node
+                watcher.poll(0.0)  # the last messages of the last node
         except LaunchError as error:
             failure = str(error)
     reports = node_reports.read_all(folder)
@@ -264,20 +264,22 @@ def _over_topics(
 
 
 def _complete(summary: Summary, folder: Path, progress: Progress, interrupts: Interrupts) -> None:
-    """Tell the summary what the bag holds: all that was said, where who listens to a run may come
-    too late for its first messages, and true rewards and labels, which nobody listens to. Takes a
-    second for each evaluation of a memory of a million steps; Ctrl-C ends it.
+    """Hand the records of the bag to the summary.
+
+    The bag holds the first messages of a run, for which the watcher may have come too late, and
+    true rewards and labels, to which it does not subscribe. Takes a second for each evaluation of
+    a memory of a million steps; Ctrl-C ends it.
     """
     from codetr_ros.bags.errors import BagError
     from codetr_ros.bags.reader import Bag
 
     if not (folder / run_folder.BAG).exists():
-        return  # no recorder came up, which the failure says
+        return  # no recorder started, and the failure names it
     asked = interrupts.count
     progress.log('reading the bag for the summary')
     try:
         bag = Bag(folder / run_folder.BAG)
-        # labels last: they may have been noted before true rewards of their phase
+        # labels last: they may have been recorded before the true rewards of their phase
         for kinds in (EpisodeResult, Metrics, Commit, TrueRewards), (StepRewards,):
             for entry in bag.entries(kinds):
                 if interrupts.count > asked:
@@ -285,13 +287,13 @@ def _complete(summary: Summary, folder: Path, progress: Progress, interrupts: In
                     return
                 summary.receive(entry.record)
     except BagError as error:
-        progress.log(f'the summary holds what was heard, and of the bag what came before: {error}')
+        progress.log(f'the summary lacks the rest of the bag: {error}')
     except RecoveryError as error:
-        progress.log(f'reward recovery cannot be told to the end: {error}')
+        progress.log(f'reward recovery is incomplete: {error}')
 
 
 def _short(path: Path) -> str:
-    """A path as people type it: relative where that is shorter."""
+    """A path as people type it: relative to the current folder where it lies within."""
     try:
         return str(path.relative_to(Path.cwd()))
     except ValueError:
@@ -299,7 +301,7 @@ def _short(path: Path) -> str:
 
 
 def show(summary: RunSummary, folder: Path, console: Console) -> None:
-    """Print what came out of a run."""
+    """Print the results of a run."""
     values = [row.true_return_mean for row in summary.evaluated()]
     known = [value for value in values if value is not None]
     if summary.evaluations and len(known) == len(values):
@@ -331,8 +333,8 @@ def show(summary: RunSummary, folder: Path, console: Console) -> None:
         console.print('\ninterrupted: what was done is kept', highlight=False)
 
 
-def say_failure(outcome: Outcome) -> None:
-    """Say on stderr why the run failed, with the end of the log that explains it."""
+def show_failure(outcome: Outcome) -> None:
+    """Print on stderr why the run failed, with the end of the log that explains it."""
     console = Console(stderr=True)
     console.print(
         f'\ncodetr: the run failed: {outcome.failure}',
