@@ -135,7 +135,7 @@ def test_a_last_step_after_which_nothing_was_observed_is_dropped():
     )
     assert steps == [(0, 0, [1.0, 1.1], [0.1], (False, True))]
     assert scores == [(0, 0, 1, 2.0)]
-    assert dict(converter.found.dropped) == {
+    assert dict(converter.conversion.dropped) == {
         converting.NO_NEXT: 1,
         episode_scores.SCORE_TRIMMED: 1,
     }
@@ -156,7 +156,7 @@ def test_there_is_no_step_across_a_hole_in_the_observations():
         said(1.7, '/state', [8.0]),
     )
     assert [(s[0], s[2]) for s in steps] == [(0, [1.0, 1.1, 4.0]), (1, [1.5, 1.6, 8.0])]
-    assert converter.found.dropped[converting.NO_OBSERVATION] == 1
+    assert converter.conversion.dropped[converting.NO_OBSERVATION] == 1
 
 
 def test_what_is_not_finite_is_no_step():
@@ -170,8 +170,8 @@ def test_what_is_not_finite_is_no_step():
     )
     assert [s[2] for s in steps] == [[1.0, 1.1], [1.3, 1.4]]
     assert scores == []
-    assert converter.found.dropped[converting.NOT_FINITE] == 1
-    assert converter.found.dropped[episode_scores.SCORE_NOT_FINITE] == 1
+    assert converter.conversion.dropped[converting.NOT_FINITE] == 1
+    assert converter.conversion.dropped[episode_scores.SCORE_NOT_FINITE] == 1
 
 
 def test_several_topics_are_one_observation_once_each_has_been_heard():
@@ -187,7 +187,7 @@ def test_several_topics_are_one_observation_once_each_has_been_heard():
     assert records[0].observations.tolist() == pytest.approx(
         np.float32([[1.1, 7, 8], [1.2, 7, 8]])
     )
-    assert converter.found.dropped[converting.NO_OBSERVATION] == 1
+    assert converter.conversion.dropped[converting.NO_OBSERVATION] == 1
 
 
 def test_commands_are_scaled_to_between_minus_1_and_1_and_clipped_with_a_count():
@@ -198,7 +198,7 @@ def test_commands_are_scaled_to_between_minus_1_and_1_and_clipped_with_a_count()
     converter = Converter(rules(action=action), 'run')
     ((chunk, _),) = [*(r for m in messages for r in converter.feed(m)), *converter.finish()]
     assert chunk.actions.tolist() == [[0.0, 1.0], [-1.0, -1.0]]
-    assert converter.found.dropped[converting.CLIPPED] == 1
+    assert converter.conversion.dropped[converting.CLIPPED] == 1
 
 
 def test_at_a_fixed_rate_the_command_holds_and_steps_begin_at_ticks():
@@ -214,7 +214,7 @@ def test_at_a_fixed_rate_the_command_holds_and_steps_begin_at_ticks():
     )
     # ticks at 1.0, 1.1, 1.2, 1.3; the last has had no observation after it
     assert steps == [(0, 0, [1.0, 3.0, 3.0, 4.0], [0.5, 0.5, -0.5], (False, True))]
-    assert (converter.found.shortest, converter.found.longest) == (0.1, 0.1)
+    assert (converter.conversion.shortest, converter.conversion.longest) == (0.1, 0.1)
 
 
 def test_a_score_is_of_all_steps_since_the_last_one():
@@ -247,8 +247,8 @@ def test_a_score_may_be_of_the_last_steps_that_are_not_scored_yet():
         said(1.46, '/state', [0.0]),
     )
     assert scores == [(0, 1, 2, 2.0), (0, 3, 2, 4.0)]
-    assert converter.found.dropped[episode_scores.SCORE_OF_NOTHING] == 1
-    assert converter.found.dropped[episode_scores.SCORE_AGAIN] == 1
+    assert converter.conversion.dropped[episode_scores.SCORE_OF_NOTHING] == 1
+    assert converter.conversion.dropped[episode_scores.SCORE_AGAIN] == 1
 
 
 def test_an_episode_of_which_nothing_is_left_leaves_no_gap_in_the_numbers():
@@ -265,7 +265,7 @@ def test_an_episode_of_which_nothing_is_left_leaves_no_gap_in_the_numbers():
     )
     assert [s[0] for s in steps] == [0, 1]
     assert scores == [(1, 0, 1, 1.0)]
-    assert converter.found.dropped[episode_scores.SCORE_DROPPED] == 1
+    assert converter.conversion.dropped[episode_scores.SCORE_DROPPED] == 1
 
 
 def test_long_episodes_come_in_chunks_that_join(monkeypatch):
@@ -281,7 +281,7 @@ def test_long_episodes_come_in_chunks_that_join(monkeypatch):
 
 def test_messages_that_go_back_in_time_are_counted():
     _, _, converter = run(rules(), *commands(1.0, 1.1), said(0.5, '/state', [0.0]))
-    assert converter.found.dropped[converting.BACKWARDS] == 1
+    assert converter.conversion.dropped[converting.BACKWARDS] == 1
 
 
 def joint_state(names, position):
@@ -321,8 +321,8 @@ def test_a_field_that_does_not_exist_is_named_with_those_that_do(path, expected)
 @pytest.mark.parametrize(
     ('changes', 'expected'),
     [
-        ({'sampling': {'by': 'rate'}}, 'rate is to be given where `by` is rate'),
-        ({'score': {'topic': '/s', 'of': 'last_steps'}}, 'steps is to be given where `of`'),
+        ({'sampling': {'by': 'rate'}}, 'rate must be given if `by` is rate'),
+        ({'score': {'topic': '/s', 'of': 'last_steps'}}, 'steps must be given if `of`'),
         (
             {'action': {'topic': 'x', 'fields': ['data']}},
             "action.topic = 'x': String should match",

@@ -52,8 +52,8 @@ def test_chunks_make_an_episode_and_scores_may_come_before_their_steps(tmp_path)
     a, b = steps(14, [0, 9])
     found = stretches(index(tmp_path, [a, *scores((0, 7), (7, 7)), b]), 7, 100)
 
-    assert spans(found.found) == [(0, 14, [0, 7])]
-    assert found.found[0].segments.values.tolist() == [0.0, 7.0]
+    assert spans(found.usable) == [(0, 14, [0, 7])]
+    assert found.usable[0].segments.values.tolist() == [0.0, 7.0]
     assert (found.unscored, dict(found.skipped)) == (
         0,
         {episodes.NO_STEPS: 0, episodes.TOO_LONG: 0},
@@ -71,7 +71,7 @@ def test_a_segment_across_a_gap_is_left_out_and_what_lies_beyond_it_is_not(tmp_p
     a, _, c = steps(21, [0, 5, 9])
     found = stretches(index(tmp_path, [a, c, *scores((0, 7), (7, 7), (14, 7))]), 7, 100)
 
-    assert spans(found.found) == [(9, 12, [14])]
+    assert spans(found.usable) == [(9, 12, [14])]
     assert found.skipped[episodes.NO_STEPS] == 2
     assert found.unscored == 17 - 7
 
@@ -82,7 +82,7 @@ def test_steps_that_do_not_join_are_kept_apart(tmp_path):
     found = stretches(index(tmp_path, [a, b, *scores((0, 7), (7, 7))]), 7, 100)
 
     assert found.skipped[episodes.UNJOINED] == 1
-    assert spans(found.found) == [(5, 9, [7])]
+    assert spans(found.usable) == [(5, 9, [7])]
 
 
 def test_what_is_not_finite_is_left_out_and_may_come_again(tmp_path):
@@ -99,7 +99,7 @@ def test_a_step_counts_for_one_score_only(tmp_path):
     (a,) = steps(14, [0])
     found = stretches(index(tmp_path, [a, *scores((0, 7), (0, 7), (5, 7), (7, 3))]), 7, 100)
 
-    assert spans(found.found) == [(0, 14, [0, 7])]
+    assert spans(found.usable) == [(0, 14, [0, 7])]
     assert found.skipped[episodes.OVERLAP] == 2
 
 
@@ -107,14 +107,14 @@ def test_a_score_of_more_steps_than_the_delay_is_left_out(tmp_path):
     (a,) = steps(14, [0])
     found = stretches(index(tmp_path, [a, *scores((0, 9), (9, 4))]), 7, 100)
 
-    assert spans(found.found) == [(0, 14, [9])]
+    assert spans(found.usable) == [(0, 14, [9])]
     assert found.skipped[episodes.TOO_LONG] == 1
 
 
 def test_a_long_episode_is_cut_between_segments_and_loses_none(tmp_path):
     (a,) = steps(100, [0])
     places = [(i, 7) for i in range(0, 98, 7)]
-    found = stretches(index(tmp_path, [a, *scores(*places)]), 7, 30).found
+    found = stretches(index(tmp_path, [a, *scores(*places)]), 7, 30).usable
 
     assert [s.steps for s in found] == [28, 28, 28, 16]
     assert [f for s in found for f in s.segments.firsts.tolist()] == [p[0] for p in places]
@@ -137,7 +137,7 @@ def test_a_copy_is_known_though_its_scores_come_before_its_steps(tmp_path):
     found = index(tmp_path, [a, *scores((0, 7))], [*scores((0, 7)), a, *scores((7, 7))])
 
     assert (found.steps, found.scores, found.skipped[episodes.COPIES]) == (14, 1, 14)
-    assert len(stretches(found, 7, 100).found) == 1
+    assert len(stretches(found, 7, 100).usable) == 1
 
 
 def test_other_steps_under_the_same_names_in_another_bag_are_learnt_from(tmp_path):
@@ -145,7 +145,7 @@ def test_other_steps_under_the_same_names_in_another_bag_are_learnt_from(tmp_pat
     b = replace(a, observations=a.observations + 1)
     found = index(tmp_path, [a, score()], [b, score()])
 
-    assert len(stretches(found, 7, 100).found) == 2
+    assert len(stretches(found, 7, 100).usable) == 2
 
 
 @pytest.mark.parametrize(

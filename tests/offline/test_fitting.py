@@ -54,7 +54,7 @@ def records(count, seed=0, size=3):
 
 def prepared(tmp_path, count=20, size=3):
     bag = Bag(write(tmp_path / 'bag', records(count, size=size)))
-    found = stretches(Index([bag]).read(), DELAY, 10_000).found
+    found = stretches(Index([bag]).read(), DELAY, 10_000).usable
     return [bag], found
 
 
@@ -84,7 +84,7 @@ def test_a_memory_holds_the_very_steps_scores_and_true_rewards_of_the_bag(tmp_pa
 
 def test_true_rewards_that_a_bag_has_not_are_nan_not_numbers(tmp_path):
     bag = Bag(write(tmp_path / 'bag', (r for r in records(2) if not isinstance(r, TrueRewards))))
-    found = stretches(Index([bag]).read(), DELAY, 100).found
+    found = stretches(Index([bag]).read(), DELAY, 100).usable
 
     batch = (loaded := load([bag], found, SIZES, DELAY, true_rewards=True)).memory.segments.batch(
         loaded.memory.segments.ids()
@@ -217,7 +217,7 @@ def test_training_that_diverges_keeps_the_best_weights_so_far(tmp_path):
         for r in records(20)
     )
     bag = Bag(write(tmp_path / 'bag', huge))
-    found = stretches(Index([bag]).read(), DELAY, 100).found
+    found = stretches(Index([bag]).read(), DELAY, 100).usable
     settings = tiny(target_scale='none')
     plan = fitting.plan(found, settings, how())
 

@@ -142,7 +142,7 @@ def test_two_runs_in_a_bag_must_be_told_apart(a_run, tmp_path, capsys):
     bag = write(tmp_path / 'bag', [*a_run.records, other])
 
     fit(bag, tmp_path / 'out', code=2)
-    assert 'holds the runs calls, other: say which one with --run' in capsys.readouterr().err
+    assert 'holds the runs calls, other: choose one with --run' in capsys.readouterr().err
     fit(bag, tmp_path / 'out', '--run', 'mine', code=2)
     assert "holds no run 'mine'; it holds calls, other" in capsys.readouterr().err
     said = fit(bag, tmp_path / 'chosen', '--run', 'calls')

@@ -1,1 +1,1 @@
-"""Reward models from bags: fitted, judged and put to use without any node and without ROS."""
+"""Fit, judge and use reward models on bags, without any node and without ROS."""

@@ -1,4 +1,4 @@
-"""`codetr convert`: a bag to fit, of a bag with ordinary topics."""
+"""`codetr convert`: write a bag for `codetr fit` from a bag with ordinary topics."""
 
 from collections.abc import Iterator
 from contextlib import closing
@@ -18,28 +18,28 @@ from codetr_ros.records.fields import type_name
 
 
 def convert(bag: Bag, rules: Mapping, folder: Path) -> Conversion:
-    """Write a bag to fit.
+    """Write a bag for `codetr fit`.
 
     Args:
         bag: the bag with ordinary topics; it is not touched.
         rules: the mapping.
-        folder: the new bag: does not exist, or is empty.
+        folder: of the new bag: does not exist, or is empty.
 
     Raises:
-        BagError: the bag cannot be read, or the new one not be written.
+        BagError: the bag cannot be read, or the new one cannot be written.
         FitError: the mapping names something that is not in the bag.
     """
     if missing := sorted(rules.topics - bag.topics.keys()):
         raise FitError(
             f'{bag.path} has no topic {", ".join(missing)}. It has: {", ".join(bag.topics)}'
         )
-    made = Converter(rules, folder.name)
+    converter = Converter(rules, folder.name)
     with unfinished(folder, 'convert again') as new:
-        _write(_records(bag, rules, made), rules.source, new)
-        if not made.found.steps:
-            lost = ', '.join(f'{n} {what}' for what, n in made.found.dropped.items())
-            raise FitError(f'{bag.path}: not one step could be made: {lost or "no command"}')
-    return made.found
+        _write(_records(bag, rules, converter), rules.source, new)
+        if not converter.conversion.steps:
+            lost = ', '.join(f'{n} {what}' for what, n in converter.conversion.dropped.items())
+            raise FitError(f'{bag.path}: not one step could be converter: {lost or "no command"}')
+    return converter.conversion
 
 
 def _write(records: Iterator[Timed], source: str, folder: Path) -> None:
@@ -50,7 +50,7 @@ def _write(records: Iterator[Timed], source: str, folder: Path) -> None:
             writer.write(names[type(record)], encode(record, time), time)
 
 
-def _records(bag: Bag, rules: Mapping, made: Converter) -> Iterator[Timed]:
+def _records(bag: Bag, rules: Mapping, converter: Converter) -> Iterator[Timed]:
     for message in bag.messages(topics=rules.topics):
-        yield from made.feed(message)
-    yield from made.finish()
+        yield from converter.feed(message)
+    yield from converter.finish()

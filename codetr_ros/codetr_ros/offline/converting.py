@@ -1,19 +1,19 @@
-"""Ordinary topics into steps and scores, message by message, as a mapping says.
+"""Turn ordinary topics into steps and scores, message by message, by a mapping.
 
-The rules of time, where `now` is when a message was received (its log time):
+The rules of time, where `now` is the time at which a message was received (its log time):
 
-* What was last received holds (zero-order hold), at most `max_age` seconds for observations.
+* The last value received holds (zero-order hold), at most `max_age` seconds for observations.
 * A step begins with each command, or at a fixed rate from an episode's first command on. Its
-  observation is what holds at its begin, its action the command that holds then; its next
-  observation is what holds at the begin of the next step.
-* An episode ends where the episode topic says so, where no command comes for `gap` seconds, and
-  where a step has no observation that is young and finite: there is no step across a hole.
-* The next observation of an episode's last step is what holds at its end, or as long after its
-  begin as the step before took, where that is earlier. If nothing was observed in between, the
-  step is dropped.
-* Which steps a score is of, `episode_scores` says.
+  observation and action are those that hold at its begin; its next observation is the one that
+  holds at the begin of the next step.
+* An episode ends at a message of the episode topic, where no command comes for `gap` seconds, and
+  where a step has no observation that is young and finite: no step crosses a hole.
+* The next observation of an episode's last step is the one that holds at the episode's end. If the
+  step before took less time than is left until then, it is the one that holds after that time.
+  If nothing was observed in between, the step is dropped.
+* `episode_scores` decides which steps a score is of.
 
-Whatever is dropped is counted.
+Everything that is dropped is counted.
 """
 
 from collections.abc import Iterator
@@ -58,31 +58,31 @@ class Converter:
     """
 
     def __init__(self, rules: Mapping, run_id: str) -> None:
-        self.found = Conversion()
+        self.conversion = Conversion()
         self._rules = rules
         self._run_id = run_id
         self._now = 0
         self._held: list[tuple[int, F64] | None] = [None] * len(rules.observation)
         self._seconds = 0  # [ns] that the last whole step took; 0 in an episode's first
-        # what held that long after the pending step's begin, once that time has passed
+        # the values that held `_seconds` after the pending step's begin, once that time has passed
         self._then: tuple[int, list[tuple[int, F64] | None]] | None = None
         self._command: tuple[int, F64] | None = None
         self._tick: int | None = None  # when the next step begins, at a fixed rate
-        self._pending: _Step | None = None  # begun, its next observation is not known yet
+        self._pending: _Step | None = None  # begun, without its next observation yet
         self._steps: list[_Step] = []  # whole and not yet written
         self._last: F64 = np.empty(0)  # the observation after them
         self._episode = -1
         self._open = False
         self._written = 0  # steps of the episode that were written
-        self._scores = EpisodeScores(rules, run_id, self.found)
+        self._scores = EpisodeScores(rules, run_id, self.conversion)
         self._sequence = 0
 
     def feed(self, message: Message) -> Iterator[Timed]:
-        """Take a message; the records that are whole with it."""
+        """Take a message; yields the records that it completes."""
         if message.log_time < self._now:
-            self.found.dropped[BACKWARDS] += 1
+            self.conversion.dropped[BACKWARDS] += 1
         self._now = max(self._now, message.log_time)
-        self.found.messages[message.topic] += 1
+        self.conversion.messages[message.topic] += 1
         yield from self._until(self._now)
         self._look()
         for i, values in enumerate(self._rules.observation):
@@ -100,20 +100,20 @@ class Converter:
             yield from self._end(self._rules.episode.terminal)
 
     def finish(self) -> Iterator[Timed]:
-        """The bag has ended."""
+        """End the last episode; yields its records."""
         yield from self._until(self._now + 1)
         yield from self._end(False)
         yield from self._give_scores()
 
     def _give_scores(self) -> Iterator[Timed]:
-        """The scores of the episode that has ended, once no more can come."""
+        """Yield the scores of the ended episode, once no more can come."""
         for score in self._scores.give(self._episode, self._written):
             yield score, self._now
 
     def _numbers(self, message: Message, values: mapping.Values) -> F64 | None:
         array = mapping.numbers(message.message, values)
         if array is None:
-            self.found.dropped[NO_JOINTS] += 1
+            self.conversion.dropped[NO_JOINTS] += 1
         return array
 
     def _ends(self, message: Message) -> bool:
@@ -126,7 +126,7 @@ class Converter:
     # steps
 
     def _until(self, now: int) -> Iterator[Timed]:
-        """What time alone brings about before `now`: steps at a fixed rate, and gaps."""
+        """Do what is due before `now` by time alone: steps at a fixed rate, and gaps."""
         gap = round(self._rules.episode.gap * NS)
         while self._command is not None:
             over = self._command[0] + gap
@@ -149,14 +149,14 @@ class Converter:
             self._tick = self._now
 
     def _look(self) -> None:
-        """Keep what holds when a step that may turn out to be the last has taken its time."""
+        """Keep the values that hold after a step's usual time, in case the step is the last."""
         if self._pending is not None and self._then is None and self._seconds:
             over = self._pending.time + self._seconds
             if self._now > over:
                 self._then = (over, list(self._held))
 
     def _observed(self, now: int, held: list[tuple[int, F64] | None]) -> F64 | None:
-        """What holds now; None where something is missing or too old."""
+        """The observation that holds now; None where a part is missing or too old."""
         oldest = now - round(self._rules.sampling.max_age * NS)
         parts = [one[1] for one in held if one is not None and one[0] >= oldest]
         return np.concatenate(parts) if len(parts) == len(held) else None
@@ -165,19 +165,19 @@ class Converter:
         """Begin a step."""
         observation = self._observed(now, self._held)
         if observation is None:
-            self.found.dropped[NO_OBSERVATION] += 1
+            self.conversion.dropped[NO_OBSERVATION] += 1
             yield from self._end(False)
             return
         if not (_finite(observation) and _finite(command)):
-            self.found.dropped[NOT_FINITE] += 1
+            self.conversion.dropped[NOT_FINITE] += 1
             yield from self._end(False)
             return
         action = self._scaled(command)
         self._check_sizes(len(observation), len(action))
         if self._pending is not None:
             self._seconds = now - self._pending.time
-            self.found.shortest = min(self.found.shortest, self._seconds / NS)
-            self.found.longest = max(self.found.longest, self._seconds / NS)
+            self.conversion.shortest = min(self.conversion.shortest, self._seconds / NS)
+            self.conversion.longest = max(self.conversion.longest, self._seconds / NS)
             yield from self._complete(observation)
         elif not self._open:
             yield from self._give_scores()
@@ -190,7 +190,7 @@ class Converter:
         self._scores.step_begun()
 
     def _complete(self, observation: F64) -> Iterator[Timed]:
-        """The next observation of the pending step is known."""
+        """Complete the pending step with its next observation."""
         assert self._pending is not None
         room = max(1, MESSAGE_BYTES // (4 * (len(observation) + len(self._pending.action))))
         if len(self._steps) >= room:
@@ -200,7 +200,7 @@ class Converter:
         self._pending = None
 
     def _end(self, terminal: bool) -> Iterator[Timed]:
-        """End the episode, if one is going on."""
+        """End the episode, if there is one."""
         pending, self._command, self._tick = self._pending, None, None
         if pending is not None:
             self._look()
@@ -210,14 +210,14 @@ class Converter:
             if after is not None and _finite(after):
                 yield from self._complete(after)
             else:
-                self.found.dropped[NO_NEXT] += 1
+                self.conversion.dropped[NO_NEXT] += 1
                 self._pending = None
                 self._scores.step_dropped()
         if self._steps:
-            self.found.episodes += 1
+            self.conversion.episodes += 1
             yield from self._write(terminal, not terminal)
         elif self._open and not self._written:
-            self._episode -= 1  # nothing of it is left
+            self._episode -= 1  # no step of it is left
         self._open = False
         self._seconds = 0
 
@@ -231,17 +231,17 @@ class Converter:
                 )
         scaled: F64 = 2 * (command - low) / (high - low) - 1
         if (np.abs(scaled) > 1 + 1e-9).any():
-            self.found.dropped[CLIPPED] += 1
+            self.conversion.dropped[CLIPPED] += 1
         return np.clip(scaled, -1, 1)
 
     def _check_sizes(self, observations: int, actions: int) -> None:
         sizes = (observations, actions)
-        if self.found.sizes == (0, 0):
-            self.found.sizes = sizes
-        if self.found.sizes != sizes:
+        if self.conversion.sizes == (0, 0):
+            self.conversion.sizes = sizes
+        if self.conversion.sizes != sizes:
             raise FitError(
-                f'observations and actions had the sizes {self.found.sizes}, and now {sizes}: a '
-                'field in the mapping has no fixed length. Name elements, or joints'
+                f'observations and actions had the sizes {self.conversion.sizes}, and now '
+                f'{sizes}: a field in the mapping has no fixed length. Name elements, or joints'
             )
 
     def _write(self, terminated: bool, truncated: bool) -> Iterator[Timed]:
@@ -264,12 +264,12 @@ class Converter:
         )
         self._sequence += 1
         self._written += len(steps)
-        self.found.steps += len(steps)
+        self.conversion.steps += len(steps)
         yield chunk, self._now
 
 
 def _finite(values: F64) -> bool:
-    """Whether these are numbers that float32 has."""
+    """Whether all values are finite in float32."""
     return bool((np.abs(values) <= np.finfo(np.float32).max).all())
 
 

@@ -1,8 +1,8 @@
-"""Scores of an episode that is being converted: which steps each is of, and what becomes of it.
+"""Scores of an episode that is being converted: find the steps of each, and keep or drop it.
 
-A score is of steps that began before it or with it. It belongs to the episode that is going on, or
-has ended while no new one has begun. A score of all steps since the last one is of one step less
-where the last step was dropped. What is dropped is counted.
+A score is of steps that began before it or with it. It belongs to the current episode, or to the
+last one while no new one has begun. A score of all steps since the last score loses a step where
+the last step was dropped. Everything that is dropped is counted.
 """
 
 from collections import Counter
@@ -26,7 +26,7 @@ SCORE_TRIMMED = 'scores whose last step was dropped, taken as of those before it
 
 @dataclass
 class Conversion:
-    """What became of a bag."""
+    """The counts of a conversion."""
 
     messages: Counter[str] = field(default_factory=Counter)  # read, by topic
     episodes: int = 0
@@ -45,27 +45,27 @@ class EpisodeScores:
     Args:
         rules: the mapping.
         run_id: of the records.
-        found: where scores are counted, and those that are dropped.
+        conversion: counts scores, and those that are dropped.
     """
 
-    def __init__(self, rules: Mapping, run_id: str, found: Conversion) -> None:
+    def __init__(self, rules: Mapping, run_id: str, conversion: Conversion) -> None:
         self._rules = rules
         self._run_id = run_id
-        self._found = found
-        self._begun = 0  # steps of the episode that were begun and not dropped
+        self._conversion = conversion
+        self._begun = 0  # steps of the episode that have begun, without dropped ones
         self._scored = 0  # its steps before this one have had their score
         self._held: list[tuple[int, int, float]] = []  # first step, length, value
 
     def begin_episode(self) -> None:
-        """An episode begins; the scores of the one before were given."""
+        """Begin an episode; the scores of the one before must have been given."""
         self._begun = self._scored = 0
 
     def step_begun(self) -> None:
-        """A step of the episode begins."""
+        """Count a step of the episode that begins."""
         self._begun += 1
 
     def step_dropped(self) -> None:
-        """The step that began last is dropped."""
+        """Drop the step that began last."""
         self._begun -= 1
 
     def take(self, message: Message) -> None:
@@ -83,39 +83,39 @@ class EpisodeScores:
         length = self._begun - self._scored if rule.steps is None else rule.steps
         first = self._begun - length
         if not np.isfinite(number):
-            self._found.dropped[SCORE_NOT_FINITE] += 1
+            self._conversion.dropped[SCORE_NOT_FINITE] += 1
         elif length < 1 or first < 0:
-            self._found.dropped[SCORE_OF_NOTHING] += 1
+            self._conversion.dropped[SCORE_OF_NOTHING] += 1
         elif first < self._scored:
-            self._found.dropped[SCORE_AGAIN] += 1
+            self._conversion.dropped[SCORE_AGAIN] += 1
         else:
             self._held.append((first, length, number))
             self._scored = self._begun
 
     def give(self, episode: int, written: int) -> Iterator[CompositeReward]:
-        """The scores of an episode that has ended.
+        """Yield the scores of an episode that has ended.
 
         Args:
             episode: its number.
-            written: how many steps of it there are.
+            written: the number of its steps.
         """
         scores, self._held = self._held, []
         for first, length, value in scores:
             there = min(length, written - first)
             if there < length:
                 trimmed = self._rules.score.of == 'since_last' and there > 0
-                self._found.dropped[SCORE_TRIMMED if trimmed else SCORE_DROPPED] += 1
+                self._conversion.dropped[SCORE_TRIMMED if trimmed else SCORE_DROPPED] += 1
                 if not trimmed:
                     continue
             yield CompositeReward(
                 run_id=self._run_id,
                 source=self._rules.source,
                 scorer=self._rules.source,
-                sequence=self._found.scores,
+                sequence=self._conversion.scores,
                 episode=episode,
                 first_step=first,
                 length=there,
                 value=value,
             )
-            self._found.scores += 1
-            self._found.scored_steps += there
+            self._conversion.scores += 1
+            self._conversion.scored_steps += there

@@ -1,8 +1,8 @@
-"""What bags hold to learn from: an index of their episodes and scores, made in one pass.
+"""An index of the episodes and scores of bags, made in one pass.
 
 The index has the places of steps, not the steps: it takes about a byte per step where a score
-comes every 25 steps. Nothing is trusted that cannot be: steps sent twice are taken once, a gap
-ends a piece, what is not finite is left out, and all of it is counted.
+comes every 25 steps. Bags are not trusted: steps sent twice are taken once, a gap ends a piece,
+values that are not finite are left out, and all of this is counted.
 """
 
 from array import array
@@ -31,7 +31,7 @@ TOO_LONG = 'scores of more steps than the delay'
 
 
 class Key(NamedTuple):
-    """Whose episodes: run ids need not be unique, so the bag is part of it."""
+    """The source of episodes. Run ids need not be unique, so the bag is part of the key."""
 
     bag: int
     run_id: str
@@ -54,18 +54,18 @@ class Piece:
 
 @dataclass(slots=True)
 class Episode:
-    """An episode as far as a bag has it."""
+    """The parts of an episode that a bag holds."""
 
     key: Key
     number: int
     pieces: list[Piece] = field(default_factory=list)
-    # its scores, in the order in which they came
+    # its scores, in the order in which they arrived
     firsts: 'array[int]' = field(default_factory=lambda: array('q'))
     lengths: 'array[int]' = field(default_factory=lambda: array('q'))
     values: 'array[float]' = field(default_factory=lambda: array('d'))
 
     def follows(self, chunk: Transitions) -> Piece | None:
-        """The piece that steps go on with, if they do."""
+        """The piece that a chunk continues, if any."""
         last = self.pieces[-1] if self.pieces else None
         return last if last and last.tail is not None and chunk.first_step == last.end else None
 
@@ -76,7 +76,7 @@ class Index:
 
     Args:
         bags: the bags.
-        run_id: only what is of this run; of all if None.
+        run_id: index this run only; all runs if None.
     """
 
     bags: Sequence[Bag]
@@ -91,18 +91,18 @@ class Index:
     scores: int = 0
     skipped: Counter[str] = field(default_factory=Counter)
     notes: list[str] = field(default_factory=list)
-    topics: dict[Key, str] = field(default_factory=dict)  # on which their steps came
-    phases: Counter[Key] = field(default_factory=Counter)  # that were begun
+    topics: dict[Key, str] = field(default_factory=dict)  # of their steps
+    phases: Counter[Key] = field(default_factory=Counter)  # that have begun
     _prints: dict[tuple[str, str, int, bytes], int] = field(default_factory=dict)
     _copies: set[tuple[Key, int]] = field(default_factory=set)
-    _said_by: str = ''  # who said the sizes
+    _first: str = ''  # the source that set the sizes
 
     def read(self) -> 'Index':
-        """Go through the bags once.
+        """Read the bags once.
 
         Raises:
             BagError: one cannot be read.
-            FitError: they are of different sizes, or of different composite rewards.
+            FitError: the bags have different sizes or composite rewards, or nothing to learn from.
         """
         kinds = (RunSpec, TaskSpec, Transitions, CompositeReward)
         for number, bag in enumerate(self.bags):
@@ -125,12 +125,12 @@ class Index:
             raise FitError(
                 f'{", ".join(str(b.path) for b in self.bags)}: no Transitions'
                 f'{f" of run {self.run_id!r}" if self.run_id else ""} to learn from: '
-                '`codetr convert` makes them of other topics'
+                '`codetr convert` makes them from other topics'
             )
         if not self.scores:
             raise FitError(
                 f'{", ".join(str(b.path) for b in self.bags)}: {self.steps} steps, but no '
-                'CompositeReward: nothing says how good they were'
+                'CompositeReward: the steps have no scores to learn from'
             )
         return self
 
@@ -140,7 +140,7 @@ class Index:
         self.runs.append((number, run))
         try:
             mine = settings_of(run, self.bags[number])
-        except SettingsError as error:  # of another version: its data is as good
+        except SettingsError as error:  # of another version; its data can still be used
             self.notes.append(f'settings not known: {error}')
             return
         for other in self.settings:
@@ -162,16 +162,16 @@ class Index:
                 self.notes.append(f'several tasks of the same sizes: {", ".join(self.tasks)}')
 
     def _sizes(self, observations: int, actions: int, who: str) -> None:
-        if not self._said_by:
+        if not self._first:
             self.observation_size, self.action_size = observations, actions
-            self._said_by = who
+            self._first = who
         for name, mine, theirs in (
             ('observation', observations, self.observation_size),
             ('action', actions, self.action_size),
         ):
             if mine != theirs:
                 raise FitError(
-                    f'{who} has {name} size {mine}, {self._said_by} has {theirs}: one model has '
+                    f'{who} has {name} size {mine}, {self._first} has {theirs}: one model has '
                     'one size, fit them apart'
                 )
 
@@ -218,7 +218,7 @@ class Index:
         if self._prints.setdefault(seen, key.bag) == key.bag:
             return False
         self._copies.add(place)
-        if known is not None:  # scores that came before their steps
+        if known is not None:  # scores that arrived before their steps
             self.scores -= len(known.firsts)
             del self.episodes[place]
         return True
@@ -231,7 +231,7 @@ class Index:
         if place in self._copies:
             return
         episode = self.episodes.get(place)
-        if episode is None:  # its steps may follow: the topics are not ordered among each other
+        if episode is None:  # its steps may follow: topics are not ordered among each other
             episode = self.episodes[place] = Episode(key, reward.episode)
         episode.firsts.append(reward.first_step)
         episode.lengths.append(reward.length)
@@ -240,15 +240,15 @@ class Index:
 
     @property
     def longest(self) -> int:
-        """Steps of the longest scored segment whose steps are there; 1 if there is none."""
-        found = 1
+        """Steps of the longest scored segment that fits into a piece; 1 if there is none."""
+        longest = 1
         for episode in self.episodes.values():
             most = max((piece.steps for piece in episode.pieces), default=0)
-            found = max(found, max((n for n in episode.lengths if n <= most), default=1))
-        return found
+            longest = max(longest, max((n for n in episode.lengths if n <= most), default=1))
+        return longest
 
     def base(self) -> Settings:
-        """The settings of the first run that says what they are, else of the preset `quick`."""
+        """The settings of the first run that has them, else of the preset `quick`."""
         return self.settings[0] if self.settings else load('quick')
 
     def facts(self) -> dict[str, Any]:
@@ -256,15 +256,14 @@ class Index:
         known = max((settings.delay for settings in self.settings), default=0)
         delay = max(known, self.longest)
         if delay != known:
-            said = f'a run in the bags has {known}'
-            why = said if known else 'no run in the bags says what it was'
+            why = f'a run in the bags has {known}' if known else 'no run in the bags has a delay'
             self.notes.append(f'delay = {delay}, the longest scored segment: {why}')
         tasks = [*self.tasks, *(settings.task for settings in self.settings), 'unknown']
         return {'delay': delay, 'task': tasks[0]}
 
 
 def sound(chunk: Transitions) -> bool:
-    """Whether all numbers of some steps are finite."""
+    """Whether all numbers of a chunk are finite."""
     return bool(np.isfinite(chunk.observations).all() and np.isfinite(chunk.actions).all())
 
 
@@ -278,7 +277,7 @@ class Segments(NamedTuple):
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Stretch:
-    """Part of an episode with its scored segments: held out or learnt from as a whole."""
+    """Part of an episode with its scored segments; held out or learnt from as a whole."""
 
     key: Key
     episode: int
@@ -289,20 +288,21 @@ class Stretch:
 
 @dataclass
 class Stretches:
-    """All that there is to learn from, and what is not."""
+    """The stretches to learn from, and the counts of the rest."""
 
-    found: list[Stretch]
+    usable: list[Stretch]
     skipped: Counter[str]
     unscored: int  # steps that no score covers
 
 
 def stretches(index: Index, delay: int, longest: int) -> Stretches:
-    """Cut what was indexed into stretches with scores.
+    """Cut the indexed episodes into stretches with scores.
 
     Args:
-        index: what the bags hold.
+        index: of the bags.
         delay: scores of more steps are left out.
-        longest: a longer piece is cut, between two segments, into stretches of about so many.
+        longest: a longer piece is cut, between two segments, into stretches of about this many
+            steps.
     """
     made = Stretches([], Counter(index.skipped), index.steps)
     for episode in index.episodes.values():
@@ -313,12 +313,12 @@ def stretches(index: Index, delay: int, longest: int) -> Stretches:
                 segments.firsts + segments.lengths <= piece.end
             )
             mine = Segments(*(part[inside] for part in segments))
-            made.found += _cut(episode, piece, mine, longest)
+            made.usable += _cut(episode, piece, mine, longest)
     return made
 
 
 def _sound_segments(episode: Episode, delay: int, skipped: 'Counter[str]') -> Segments:
-    """The scores of an episode that are of steps which are there, each step in one at most."""
+    """The scores of an episode whose steps are all there, without overlaps."""
     order = np.argsort(np.asarray(episode.firsts, np.int64), kind='stable')
     firsts = np.asarray(episode.firsts, np.int64)[order]
     lengths = np.asarray(episode.lengths, np.int64)[order]
@@ -341,7 +341,7 @@ def _sound_segments(episode: Episode, delay: int, skipped: 'Counter[str]') -> Se
 
 
 def _cut(episode: Episode, piece: Piece, segments: Segments, longest: int) -> list[Stretch]:
-    found = []
+    cut = []
     begin, at = piece.first, 0
     ends = segments.firsts + segments.lengths
     while at < len(ends):
@@ -349,7 +349,7 @@ def _cut(episode: Episode, piece: Piece, segments: Segments, longest: int) -> li
         last = upto == len(ends)
         end = int(ends[upto - 1]) if not last or piece.end - begin > longest else piece.end
         mine = Segments(*(part[at:upto] for part in segments))
-        found.append(
+        cut.append(
             Stretch(
                 key=episode.key,
                 episode=episode.number,
@@ -359,4 +359,4 @@ def _cut(episode: Episode, piece: Piece, segments: Segments, longest: int) -> li
             )
         )
         begin, at = end, upto
-    return found
+    return cut

@@ -1,2 +1,2 @@
 class FitError(ValueError):
-    """Data that nothing can be fitted on, or labelled with: names it, the value and the remedy."""
+    """Data that cannot be fitted, labelled or converted: names it, the value and the remedy."""

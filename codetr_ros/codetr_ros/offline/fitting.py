@@ -1,14 +1,13 @@
 """`codetr fit --schedule epochs`: gradient steps on whole bags, early stopping on held-out data.
 
-What is held out is chosen by seed, in stretches (an episode, or a part of a very long one), so
-that no segment that judges the model is a neighbour of one that taught it, apart from the cuts of
-long episodes. It is kept in memory for the whole fit, within its share of `memory_steps`; what
-does not fit into that share is learnt from instead.
+The seed chooses the held-out stretches: episodes, or parts of very long ones. So no segment that
+judges the model is a neighbour of one that taught it, apart from the cuts of long episodes. They
+stay in memory for the whole fit, within their share of `memory_steps`; stretches that do not fit
+into that share are learnt from instead.
 
-What is learnt from is held in the rest of `memory_steps`. Where it does not fit, the stretches are
-dealt out by seed among parts that do, each an equal mix of all bags, early and late, and the bags
-are read once for each part. The target scale and the moments of the observations are those of the
-first part.
+The other stretches are held in the rest of `memory_steps`. If they do not fit, the seed deals them
+out among parts that do, each an equal mix of all bags, early and late, and the bags are read once
+for each part. The target scale and the moments of the observations are those of the first part.
 """
 
 import time
@@ -36,7 +35,7 @@ BATCH = 256
 
 @dataclass
 class Plan:
-    """What is held out, and what is learnt from at a time."""
+    """The stretches to hold out and to learn from."""
 
     held_out: list[Stretch]
     learnt: list[Stretch]
@@ -44,13 +43,13 @@ class Plan:
 
     @property
     def passes(self) -> int:
-        """Parts into which what is learnt from is divided."""
+        """Parts into which `learnt` is divided."""
         return max(1, -(-sum(s.steps for s in self.learnt) // self.capacity))
 
 
 @dataclass
 class Check:
-    """A look at the held-out data."""
+    """The losses at one look at the held-out data."""
 
     gradient_steps: int
     loss: float | None  # mean of the batches since the look before, in units of c
@@ -59,45 +58,45 @@ class Check:
 
 @dataclass
 class Fitted:
-    """What came out of a fit."""
+    """The result of a fit."""
 
     method: RewardMethod  # with its best weights
     held_out: Loaded
-    begun_at: int = 0  # gradient steps of the model that it began with
+    begun_at: int = 0  # gradient steps of the initial model
     curve: list[Check] = field(default_factory=list)
     best: Check | None = None
     kept: dict[str, torch.Tensor] | None = None  # the weights of the best look
     stopped: str = ''
     most_steps: int = 0  # held at any time
-    reads: int = 0  # times that the bags were read, the index not counted
+    reads: int = 0  # of the bags, without that of the index
     seconds: float = 0.0
 
 
-def plan(found: Sequence[Stretch], settings: Settings, fit: FitSettings) -> Plan:
-    """Choose what is held out.
+def plan(stretches: Sequence[Stretch], settings: Settings, fit: FitSettings) -> Plan:
+    """Choose the stretches to hold out.
 
     Raises:
         FitError: there are too few stretches, or one does not fit into the memory.
     """
-    if len(found) < 2:
+    if len(stretches) < 2:
         raise FitError(
-            f'there is {len(found)} episode with scores: one to learn from and one to be judged '
-            'by are the least. Give more bags, or lower stretch_steps '
-            f'({fit.stretch_steps}) to cut long episodes'
+            f'there is {len(stretches)} episode with scores: one to learn from and one to judge '
+            f'by are needed. Give more bags, or lower stretch_steps ({fit.stretch_steps}) to cut '
+            'long episodes'
         )
-    total = sum(s.steps for s in found)
+    total = sum(s.steps for s in stretches)
     share = int(fit.validation * min(total, settings.memory_steps))
-    order = generator(settings.seed, 'fit', 'split').permutation(len(found)).tolist()
+    order = generator(settings.seed, 'fit', 'split').permutation(len(stretches)).tolist()
     held: set[int] = set()
     steps = 0
     for i in order[:-1]:
-        # one in any case, and then as many as there is room for
-        if not held or steps + found[i].steps <= share:
+        # always one, then as many as there is room for
+        if not held or steps + stretches[i].steps <= share:
             held.add(i)
-            steps += found[i].steps
+            steps += stretches[i].steps
     made = Plan(
-        [s for i, s in enumerate(found) if i in held],
-        [s for i, s in enumerate(found) if i not in held],
+        [s for i, s in enumerate(stretches) if i in held],
+        [s for i, s in enumerate(stretches) if i not in held],
         settings.memory_steps - steps,
     )
     longest = max(s.steps for s in made.learnt)
@@ -111,8 +110,8 @@ def plan(found: Sequence[Stretch], settings: Settings, fit: FitSettings) -> Plan
 
 
 def parts(made: Plan, seed: int) -> Iterator[tuple[int, list[Stretch]]]:
-    """What is held at a time, for ever, and in which turn through all of it: all of it again and
-    again, or random parts.
+    """The stretches to hold at a time, without end, each with its turn through all of them: all
+    stretches if they fit, else random parts.
     """
     for turn in count():
         order = generator(seed, 'fit', 'part', turn).permutation(len(made.learnt)).tolist()
@@ -134,45 +133,45 @@ def fit(
     sizes: tuple[int, int],
     settings: Settings,
     how: FitSettings,
-    say: Callable[[Check], None] = lambda check: None,
+    report: Callable[[Check], None] = lambda check: None,
     method: RewardMethod | None = None,
 ) -> Fitted:
-    """Fit a reward method to what the plan says.
+    """Fit a reward method by a plan.
 
     Args:
         bags: all bags, in the order of the index.
-        made: what is held out, what is learnt from.
+        made: the plan.
         sizes: of observations and actions.
         settings: method, its settings, seed, delay, memory_steps, threads.
         how: the schedule.
-        say: is told of each look at the held-out data.
-        method: what is fitted, such as a restored one; a new one if None.
+        report: called with each look at the held-out data.
+        method: the method to fit, such as a restored one; a new one if None.
 
     Returns:
-        The best weights that were found, also where training diverged or was interrupted
-        (Ctrl-C) after them: `stopped` says so.
+        The best weights, also if training diverged or was interrupted (Ctrl-C) after them:
+        `stopped` gives the reason.
 
     Raises:
         BagError: a bag cannot be read.
-        FitError: a bag has changed meanwhile.
+        FitError: a bag has changed since it was indexed.
         RewardModelError: training has diverged before anything was learnt.
     """
     torch.set_num_threads(settings.threads)
     began = time.perf_counter()
     method = method or registry.make(settings, *sizes)
     held_out = load(bags, made.held_out, sizes, settings.delay, true_rewards=True)
-    found = Fitted(method, held_out, method.gradient_steps, reads=1)
+    fitted = Fitted(method, held_out, method.gradient_steps, reads=1)
     try:
-        _fit(bags, made, sizes, settings, how, found, say)
+        _fit(bags, made, sizes, settings, how, fitted, report)
     except (KeyboardInterrupt, RewardModelError) as error:
-        if found.kept is None:
+        if fitted.kept is None:
             raise
-        words = 'by Ctrl-C' if isinstance(error, KeyboardInterrupt) else str(error)
-        found.stopped = f'before its time, {words}'
-    if found.kept is not None:
-        method.load_state(found.kept)
-    found.seconds = time.perf_counter() - began
-    return found
+        cause = 'by Ctrl-C' if isinstance(error, KeyboardInterrupt) else str(error)
+        fitted.stopped = f'before its time, {cause}'
+    if fitted.kept is not None:
+        method.load_state(fitted.kept)
+    fitted.seconds = time.perf_counter() - began
+    return fitted
 
 
 def _fit(
@@ -181,65 +180,65 @@ def _fit(
     sizes: tuple[int, int],
     settings: Settings,
     how: FitSettings,
-    found: Fitted,
-    say: Callable[[Check], None],
+    fitted: Fitted,
+    report: Callable[[Check], None],
 ) -> None:
-    method = found.method
+    method = fitted.method
     for turn, part in parts(made, settings.seed):
         if turn and not isinstance(method, Learned):
-            found.stopped = f'method {method.name} takes no gradient steps'
+            fitted.stopped = f'method {method.name} takes no gradient steps'
             break
         learnt = load(bags, part, sizes, settings.delay)
-        found.reads += 1
-        steps = learnt.memory.steps + found.held_out.memory.steps
-        found.most_steps = max(found.most_steps, steps)
+        fitted.reads += 1
+        steps = learnt.memory.steps + fitted.held_out.memory.steps
+        fitted.most_steps = max(fitted.most_steps, steps)
         method.prepare(learnt.memory)
         if isinstance(method, Learned):
-            for check in _learn(method, learnt, found, settings, how, made.passes == 1):
-                found.curve.append(check)
-                if found.best is None or check.held_out_loss < found.best.held_out_loss:
-                    found.best, found.kept = check, method.state()
-                say(check)
-        del learnt  # before the next part takes its memory
-        if found.stopped:
+            for check in _learn(method, learnt, fitted, settings, how, made.passes == 1):
+                fitted.curve.append(check)
+                if fitted.best is None or check.held_out_loss < fitted.best.held_out_loss:
+                    fitted.best, fitted.kept = check, method.state()
+                report(check)
+        del learnt  # before the next part is loaded
+        if fitted.stopped:
             break
 
 
 def _learn(
     method: Learned,
     learnt: Loaded,
-    found: Fitted,
+    fitted: Fitted,
     settings: Settings,
     how: FitSettings,
     alone: bool,
 ) -> Iterator[Check]:
-    """Gradient steps on one part; sets `stopped` where the fit is to end."""
+    """Take gradient steps on one part; sets `stopped` where the fit must end."""
     losses: list[float] = []
-    if not found.curve:
-        yield Check(found.begun_at, None, held_out_loss(method, found.held_out))
+    if not fitted.curve:
+        yield Check(fitted.begun_at, None, held_out_loss(method, fitted.held_out))
     while True:
         step = method.gradient_steps
         seed_torch(settings.seed, 'fit', step)
-        said = method.gradient_step(learnt.memory, generator(settings.seed, 'fit', step))
-        losses.append(said['reward_loss'])
-        taken = method.gradient_steps - found.begun_at
+        metrics = method.gradient_step(learnt.memory, generator(settings.seed, 'fit', step))
+        losses.append(metrics['reward_loss'])
+        taken = method.gradient_steps - fitted.begun_at
         done = taken >= how.gradient_steps
         if done or taken % how.check_every == 0:
             yield Check(
                 method.gradient_steps,
                 float(np.mean(losses)),
-                held_out_loss(method, found.held_out),
+                held_out_loss(method, fitted.held_out),
             )
             losses.clear()
-            assert found.best is not None
-            since = method.gradient_steps - found.best.gradient_steps
+            assert fitted.best is not None
+            since = method.gradient_steps - fitted.best.gradient_steps
             if done:
-                found.stopped = f'after {how.gradient_steps} gradient steps, as many as allowed'
+                fitted.stopped = f'after {how.gradient_steps} gradient steps, as many as allowed'
             elif since >= how.patience * how.check_every:
-                found.stopped = (
+                fitted.stopped = (
                     f'early: the held-out loss has not fallen for {since} gradient steps'
                 )
-            if found.stopped:
+            if fitted.stopped:
                 return
         if not alone and taken % how.part_steps == 0:
             return

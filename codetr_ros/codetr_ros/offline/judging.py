@@ -1,4 +1,4 @@
-"""How good a reward method is on data in a memory: its predictions, labels and attention."""
+"""Judge a reward method on data in a memory by its predictions, labels and attention."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -16,9 +16,9 @@ MEASURES = (
     *('segments', 'composite_r2', 'segments_with_true_rewards'),
     *('pearson', 'spearman', 'within_pearson', 'within_spearman'),
 )
-"""What a judgement measures."""
+"""The names of the metrics of a judgement."""
 SHOWN = 6
-"""Segments of which a report shows every step."""
+"""Number of segments of which a report shows every step."""
 
 
 @dataclass(kw_only=True)
@@ -37,25 +37,25 @@ class Shown:
 
 @dataclass(kw_only=True)
 class Judgement:
-    """What a method makes of the segments of a memory."""
+    """The metrics of a method on the segments of a memory, with the values behind them."""
 
     metrics: dict[str, float | None]
     values: F64  # (S,) composite rewards
-    predicted: F64 | None  # (S,) the same as the model has it; None for rules
+    predicted: F64 | None  # (S,) as predicted by the model; None for rules
     labels: F32  # steps whose true rewards are known, one after the other
     true: F32
     shown: list[Shown]
 
 
 def judge(method: RewardMethod, loaded: Loaded) -> Judgement:
-    """Label all segments of a memory and compare what can be compared.
+    """Label all segments of a memory, and compare labels and predictions with the truth.
 
     Args:
         method: the method, prepared.
         loaded: the memory.
 
     Returns:
-        Of the metrics those that cannot be computed are None: there is no variance, or no true
+        The judgement. Metrics that cannot be computed are None: there is no variance, or no true
         reward is known.
     """
     memory = loaded.memory
@@ -85,25 +85,25 @@ def judge(method: RewardMethod, loaded: Loaded) -> Judgement:
 def labels_of(method: RewardMethod, loaded: Loaded, ids: I64) -> F32:
     """Step rewards (S, L) of segments, NaN beyond their ends."""
     lengths = loaded.memory.segments.lengths(ids)
-    found = np.full((len(ids), int(lengths.max())), np.nan, np.float32)
+    labels = np.full((len(ids), int(lengths.max())), np.nan, np.float32)
     for i in range(0, len(ids), method.label_batch):
         some = ids[i : i + method.label_batch]
         joined = np.concatenate(list(method.label_passes(loaded.memory, some)))
-        mine = np.arange(found.shape[1]) < lengths[i : i + method.label_batch, None]
-        rows = found[i : i + method.label_batch]
+        mine = np.arange(labels.shape[1]) < lengths[i : i + method.label_batch, None]
+        rows = labels[i : i + method.label_batch]
         rows[mine] = joined
-    return found
+    return labels
 
 
 def true_rewards_of(loaded: Loaded, ids: I64) -> F32:
     """The environment's own rewards (S, L) of segments, NaN where they are not known."""
     lengths = loaded.memory.segments.lengths(ids)
-    found = np.full((len(ids), int(lengths.max())), np.nan, np.float32)
+    rewards = np.full((len(ids), int(lengths.max())), np.nan, np.float32)
     for i in range(0, len(ids), BATCH):
         batch = loaded.memory.segments.batch(ids[i : i + BATCH])
         if batch.true_rewards is not None:
-            found[i : i + BATCH, : batch.true_rewards.shape[1]] = batch.true_rewards
-    return found
+            rewards[i : i + BATCH, : batch.true_rewards.shape[1]] = batch.true_rewards
+    return rewards
 
 
 def _shown(
@@ -115,17 +115,17 @@ def _shown(
     known: np.ndarray[Any, Any],
     predicted: F64 | None,
 ) -> list[Shown]:
-    """Segments for pictures: evenly from the lowest to the highest score."""
+    """Segments for pictures, spread evenly from the lowest to the highest score."""
     memory = loaded.memory
     order = np.argsort(memory.segments.scores(ids), kind='stable')
     chosen = order[np.linspace(0, len(ids) - 1, min(SHOWN, len(ids))).round().astype(int)]
     _, episodes, firsts, lengths = memory.segments.spans(ids)[0]
-    found = []
+    shown = []
     for i in chosen.tolist():
         stretch, length = loaded.stretches[int(episodes[i])], int(lengths[i])
         batch = memory.segments.batch(ids[i : i + 1], method.context)
         weights = method.step_weights(batch)
-        found.append(
+        shown.append(
             Shown(
                 source=stretch.key.source,
                 episode=stretch.episode,
@@ -137,4 +137,4 @@ def _shown(
                 weights=None if weights is None else weights[0, batch.context[0] :],
             )
         )
-    return found
+    return shown

@@ -1,9 +1,9 @@
-"""`codetr label`: a bag with the step rewards of all its scored segments, for anybody's use.
+"""`codetr label`: write a bag with the step rewards of all its scored segments added.
 
-The new bag is the old one, message for message and byte for byte, and at its end `StepRewards` of
-every scored segment, in parts, on the topic `step_rewards` beside that of the steps. They are of
-the phase after the bag's last, so that they succeed labels that a run has recorded: of two labels
-of a step the later one holds.
+The new bag holds the messages of the old one, byte for byte. At its end follow the `StepRewards`
+of every scored segment, in parts, on the topic `step_rewards` beside that of the steps. They are
+of the phase after the bag's last, so that they replace labels that a run has recorded: the later
+of two labels of a step holds.
 """
 
 from collections import Counter
@@ -30,13 +30,13 @@ from codetr_ros.rewards.base import RewardMethod, RewardModelError
 from codetr_ros.rewards.saved import SavedModel, restore
 
 STRETCH_STEPS = 10_000
-"""Longer episodes are labelled in stretches of about so many steps."""
+"""Longer episodes are labelled in stretches of about this many steps."""
 _DEPTH = 1000
 
 
 @dataclass
 class Labelled:
-    """What came of labelling a bag."""
+    """The counts of a labelling."""
 
     messages: int = 0  # of the old bag
     segments: int = 0
@@ -52,20 +52,20 @@ def label(bag: Bag, saved: SavedModel, folder: Path, memory_steps: int) -> Label
     Args:
         bag: the bag; it is not touched.
         saved: the reward model.
-        folder: the new bag: does not exist, or is empty.
-        memory_steps: steps that are held at a time.
+        folder: of the new bag: does not exist, or is empty.
+        memory_steps: the most steps to hold at a time.
 
     Raises:
-        BagError: the bag cannot be read, or the new one not be written.
+        BagError: the bag cannot be read, or the new one cannot be written.
         FitError: there is nothing to label.
-        RewardModelError: the model is of other sizes, or its labels are not finite.
+        RewardModelError: the model has other sizes, or its labels are not finite.
     """
     index = Index([bag]).read()
     settings = saved.settings
     method = restore(saved, settings, index.observation_size, index.action_size)
-    found = stretches(index, settings.delay, min(STRETCH_STEPS, max(1, memory_steps // 4)))
-    made = Labelled(unlabelled=found.unscored, skipped=found.skipped)
-    messages = _messages(bag, index, method, found.found, memory_steps, made)
+    data = stretches(index, settings.delay, min(STRETCH_STEPS, max(1, memory_steps // 4)))
+    made = Labelled(unlabelled=data.unscored, skipped=data.skipped)
+    messages = _messages(bag, index, method, data.usable, memory_steps, made)
     with unfinished(folder, 'label again') as new:
         copied = copy(messages, new, f'labelled by {LIBRARY}')
         write_metadata(copied, new)
@@ -76,29 +76,29 @@ def _messages(
     bag: Bag,
     index: Index,
     method: RewardMethod,
-    found: Sequence[Stretch],
+    usable: Sequence[Stretch],
     memory_steps: int,
     made: Labelled,
 ) -> Iterator[RawMessage]:
-    """All messages of the bag, then those with labels."""
+    """Yield all messages of the bag, then those with labels."""
     channels: dict[str, Channel] = {}
     counts: Counter[str] = Counter()
     last: RawMessage | None = None
     for message in bag.raw():
         channels[message.channel.topic] = message.channel
         made.messages += 1
-        if message.channel.numbered:  # labels number on behind the last, gaps or not
+        if message.channel.numbered:  # labels continue after the last number, gaps or not
             topic = message.channel.topic
             counts[topic] = max(counts[topic], message.sequence + 1)
         last = message
         yield message
-    assert last is not None  # the index found steps
-    for key, parts in _parts(found).items():
+    assert last is not None  # the index has steps
+    for key, parts in _parts(usable).items():
         topic = f'{index.topics[key].rpartition("/")[0]}/{TOPICS[StepRewards]}'
         channel = channels.setdefault(topic, _channel(topic))
         if channel.type != type_name(StepRewards):
             raise BagError(
-                f'{bag.path}: topic {topic} is of type {channel.type}, so labels have no place'
+                f'{bag.path}: topic {topic} is of type {channel.type}, so it cannot hold labels'
             )
         made.topics.add(topic)
         phase = index.phases[key]
@@ -124,11 +124,11 @@ def _channel(topic: str) -> Channel:
     return Channel(topic, kind, 'cdr', definition, qos)
 
 
-def _parts(found: Sequence[Stretch]) -> dict[Key, list[list[Stretch]]]:
-    """Stretches of each source, so many together as one message has room for."""
+def _parts(usable: Sequence[Stretch]) -> dict[Key, list[list[Stretch]]]:
+    """The stretches of each source, in parts that fit into one message each."""
     parts: dict[Key, list[list[Stretch]]] = {}
     sizes: Counter[Key] = Counter()
-    for stretch in found:
+    for stretch in usable:
         size = int(stretch.segments.lengths.sum()) * 4 + len(stretch.segments.lengths) * 12
         mine = parts.setdefault(stretch.key, [])
         if not mine or sizes[stretch.key] + size > MESSAGE_BYTES:
@@ -147,7 +147,7 @@ def _records(
     parts: list[list[Stretch]],
     memory_steps: int,
 ) -> Iterator[StepRewards]:
-    """The labels of each part; the bag is read once for as many as the memory has room for."""
+    """Yield the labels of each part; the bag is read once for as many parts as memory holds."""
     begin = 0
     while begin < len(parts):
         sizes = np.cumsum([sum(s.steps for s in part) for part in parts[begin:]])
@@ -172,8 +172,8 @@ def _label(
         lengths = np.concatenate([s.segments.lengths for s in part])
         if len(values) != lengths.sum() or not np.isfinite(values).all():
             raise RewardModelError(
-                f'labels of method {method.name!r} are not finite on {bag.path}: what it holds '
-                'is far from what the model was trained on, or training had diverged'
+                f'labels of method {method.name!r} are not finite on {bag.path}: its data is far '
+                'from what the model was trained on, or training had diverged'
             )
         yield StepRewards(
             run_id=key.run_id,

@@ -1,4 +1,4 @@
-"""Stretches of bags into memories D, streaming: no more steps are held than are asked for."""
+"""Load stretches of bags into memories D as a stream: only the wanted steps are held."""
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -13,19 +13,19 @@ from codetr_ros.offline.errors import FitError
 from codetr_ros.records import F32, CompositeReward, Transitions, TrueRewards
 
 SOURCE = 'data'
-"""Name under which a memory holds the steps of all sources: stretch after stretch."""
+"""Name under which a memory holds the steps of all sources, stretch after stretch."""
 
 
 @dataclass
 class Loaded:
-    """A memory, and whose stretch each of its episodes is."""
+    """A memory, with the stretch behind each of its episodes."""
 
     memory: Trajectories
     stretches: list[Stretch]
 
 
 class _Filling:
-    """A stretch whose steps arrive; takes memory from the first of them on."""
+    """A stretch whose steps are arriving; takes memory from the first step on."""
 
     def __init__(self, stretch: Stretch, sizes: tuple[int, int]) -> None:
         self.stretch = stretch
@@ -33,7 +33,7 @@ class _Filling:
         self._sizes = sizes
 
     def take(self, chunk: Transitions) -> bool:
-        """Take what is new of some steps; whether the stretch is whole now."""
+        """Take the new steps of a chunk; returns whether the stretch is whole now."""
         begin = self.stretch.first + self.filled - chunk.first_step
         end = min(chunk.steps, self.stretch.first + self.stretch.steps - chunk.first_step)
         if begin < 0 or end <= begin:
@@ -49,7 +49,7 @@ class _Filling:
 
 
 Places = dict[tuple[Key, int], list[Stretch]]
-"""Stretches by whose episode they are part of."""
+"""Stretches by their source and episode."""
 
 
 def load(
@@ -59,18 +59,18 @@ def load(
     delay: int,
     true_rewards: bool = False,
 ) -> Loaded:
-    """Read stretches into a new memory, going once through the bags that hold them.
+    """Read stretches into a new memory, in one pass over the bags that hold them.
 
     Args:
         bags: all bags, in the order of the index.
-        wanted: what to load; the memory has room for these and no more is ever held.
+        wanted: the stretches; the memory has room for these, and no more is ever held.
         sizes: of observations and actions.
         delay: steps of the longest segment.
-        true_rewards: hold the environment's own rewards too, NaN where a bag has none.
+        true_rewards: whether to hold the environment's own rewards too, NaN where a bag has none.
 
     Raises:
         BagError: a bag cannot be read.
-        FitError: a bag is not what it was when it was indexed.
+        FitError: a bag has changed since it was indexed.
     """
     capacity = max(1, sum(s.steps for s in wanted))
     loaded = Loaded(Trajectories(*sizes, delay, capacity, 0, true_rewards, regular=False), [])
@@ -171,10 +171,10 @@ def _take_true(stretch: Stretch, record: TrueRewards, true: dict[Stretch, F32]) 
         ]
 
 
-def newest(found: Sequence[Stretch], steps: int) -> Iterator[Stretch]:
-    """The last stretches that have so many steps together at most, but one in any case."""
+def newest(stretches: Sequence[Stretch], steps: int) -> Iterator[Stretch]:
+    """The last stretches that have at most this many steps together, but always one."""
     held = 0
-    for stretch in reversed(found):
+    for stretch in reversed(stretches):
         if held and held + stretch.steps > steps:
             return
         held += stretch.steps

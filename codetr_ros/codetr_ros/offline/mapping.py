@@ -1,4 +1,4 @@
-"""The mapping file of `codetr convert`: which topics are observation, action and score."""
+"""The mapping file of `codetr convert`: defines the topics of observation, action and score."""
 
 import re
 from collections.abc import Mapping as AnyMapping
@@ -23,14 +23,14 @@ class Values(Group):
     topic: Topic = Field(description='full name')
     fields: tuple[Path_, ...] = Field(
         min_length=1,
-        description='fields in this order, such as position, data[0] or pose.position.x; of an '
-        'array all elements',
+        description='fields in this order, such as position, data[0] or pose.position.x; an array '
+        'gives all of its elements',
     )
     joints: tuple[str, ...] | None = Field(
         None,
         min_length=1,
-        description='of array fields only the elements of these joints, in this order, by the '
-        'field `name` of the message (sensor_msgs/JointState)',
+        description='take only the elements of these joints from array fields, in this order, by '
+        'the field `name` of the message (sensor_msgs/JointState)',
     )
 
 
@@ -38,7 +38,7 @@ class Action(Values):
     """The command topic."""
 
     low: float | tuple[float, ...] = Field(
-        -1.0, description='command that becomes -1; one for all components, or one for each'
+        -1.0, description='command that becomes -1; one value for all components, or one for each'
     )
     high: float | tuple[float, ...] = Field(1.0, description='command that becomes 1')
 
@@ -62,26 +62,29 @@ class Score(Group):
         description='since_last: of all steps since the last score or the begin of the episode; '
         'last_steps: of the last `steps` steps',
     )
-    steps: int | None = Field(None, ge=1, le=100_000, description='how many, where last_steps')
+    steps: int | None = Field(
+        None, ge=1, le=100_000, description='number of steps, for last_steps'
+    )
 
     @model_validator(mode='after')
     def _steps_where_needed(self) -> 'Score':
         if (self.of == 'last_steps') != (self.steps is not None):
-            raise ValueError('steps is to be given where `of` is last_steps, and only there')
+            raise ValueError('steps must be given if `of` is last_steps, and only then')
         return self
 
 
 class Episodes(Group):
-    """Where episodes end."""
+    """The ends of episodes."""
 
     topic: Topic | None = Field(None, description='a message on it ends the episode')
     field: Path_ | None = Field(None, description='only where this field ...')
     equals: bool | int | float | str | None = Field(None, description='... has this value')
     terminal: bool = Field(
-        False, description='such an end is a terminal state, not merely the end of the recording'
+        False,
+        description='whether such an end is a terminal state, not merely the end of the recording',
     )
     gap: float = Field(
-        1.0, gt=0, le=86_400, description='seconds without a command that end the episode too'
+        1.0, gt=0, le=86_400, description='seconds without a command, which end the episode too'
     )
 
     @model_validator(mode='after')
@@ -94,12 +97,12 @@ class Episodes(Group):
 
 
 class Sampling(Group):
-    """When a step is taken."""
+    """The times of steps."""
 
     by: Literal['command', 'rate'] = Field(
         'command', description='command: a step for each command; rate: at a fixed rate'
     )
-    rate: float | None = Field(None, gt=0, le=10_000, description='steps per second, where rate')
+    rate: float | None = Field(None, gt=0, le=10_000, description='steps per second, for rate')
     max_age: float = Field(
         0.2, gt=0, le=3600, description='seconds after which an observation is too old to be held'
     )
@@ -107,7 +110,7 @@ class Sampling(Group):
     @model_validator(mode='after')
     def _rate_where_needed(self) -> 'Sampling':
         if (self.by == 'rate') != (self.rate is not None):
-            raise ValueError('rate is to be given where `by` is rate, and only there')
+            raise ValueError('rate must be given if `by` is rate, and only then')
         return self
 
 
@@ -115,7 +118,9 @@ class Mapping(Group):
     """A mapping file."""
 
     source: str = Field('robot', pattern=r'^[A-Za-z_]\w*$', description='name of the robot')
-    observation: tuple[Values, ...] = Field(min_length=1, description='one after the other')
+    observation: tuple[Values, ...] = Field(
+        min_length=1, description='topics, one after the other'
+    )
     action: Action
     score: Score
     episode: Episodes = Field(default_factory=Episodes)
@@ -123,7 +128,7 @@ class Mapping(Group):
 
     @property
     def topics(self) -> set[str]:
-        """All topics that it names."""
+        """All topics of the mapping."""
         named = {values.topic for values in self.observation}
         named |= {self.action.topic, self.score.topic}
         return named | ({self.episode.topic} if self.episode.topic else set())
@@ -133,7 +138,7 @@ def load(path: Path) -> Mapping:
     """Read a mapping file.
 
     Raises:
-        SettingsError: it cannot be read, is not YAML, or something in it is refused.
+        SettingsError: it cannot be read, is not YAML, or has a wrong key or value.
     """
     try:
         data = yaml.safe_load(path.read_text())
@@ -157,9 +162,9 @@ def field(message: Any, path: str, topic: str) -> Any:
     """
     value = message
     for part in path.split('.'):
-        found = _PART.match(part)
-        assert found is not None  # the pattern of the mapping
-        name, index = found[1], found[2]
+        matched = _PART.match(part)
+        assert matched is not None  # by the pattern of the mapping
+        name, index = matched[1], matched[2]
         if not hasattr(value, name):
             there = [n for n in getattr(value, '__dict__', ()) if not n.startswith('_')]
             raise FitError(
@@ -175,7 +180,7 @@ def field(message: Any, path: str, topic: str) -> Any:
 
 
 def numbers(message: Any, values: Values) -> F64 | None:
-    """The numbers of a message, in order; None where it has not all of the joints.
+    """The numbers of a message, in order; None if a joint is missing.
 
     Raises:
         FitError: a field does not exist or holds no numbers.
@@ -186,7 +191,7 @@ def numbers(message: Any, values: Values) -> F64 | None:
         if any(joint not in names for joint in values.joints):
             return None
         rows = [names.index(joint) for joint in values.joints]
-    found = []
+    arrays = []
     for path in values.fields:
         value = field(message, path, values.topic)
         try:
@@ -195,7 +200,7 @@ def numbers(message: Any, values: Values) -> F64 | None:
             raise FitError(f'{values.topic}: field {path!r} holds no numbers') from None
         if rows is not None:
             if len(array) <= max(rows):
-                return None  # JointState leaves fields empty that are not known
+                return None  # JointState leaves unknown fields empty
             array = array[rows]
-        found.append(array)
-    return np.concatenate(found)
+        arrays.append(array)
+    return np.concatenate(arrays)

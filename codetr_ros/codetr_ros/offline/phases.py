@@ -1,8 +1,8 @@
-"""`codetr fit --schedule phases`: what the reward node learnt in a run, learnt again from its bag.
+"""`codetr fit --schedule phases`: learn from a run's bag what its reward node learnt.
 
-The bag says in `Commit`s what was learnt from, and when. Here the very core of the reward node is
-handed what the bag holds, in its order, and does its work after each commit as it did in the run:
-with the run's settings, on the same CPU and versions, it ends with the same weights, bit for bit.
+The `Commit`s of the bag name the records that were learnt from, and when. The core of the reward
+node receives the records of the bag in their order, and does its work after each commit as in the
+run. With the run's settings, CPU and versions, it ends with the same weights, bit for bit.
 """
 
 from collections import Counter
@@ -21,12 +21,12 @@ from codetr_ros.offline.errors import FitError
 from codetr_ros.records import TOPICS, Commit, Metrics, Record, RecordError, RunSpec, StepRewards
 
 NODE = 'reward'
-"""Name under which the core speaks; nothing is learnt from it."""
+"""Name under which the core publishes; nothing is learnt from it."""
 
 
 @dataclass
 class Recorded:
-    """The labels that the bag holds, compared with those made from it."""
+    """Compares the labels that the bag holds with those made from it."""
 
     same: int = 0  # segments, or runs of steps of one
     other: int = 0
@@ -45,20 +45,20 @@ class Recorded:
                 self.other += 1
 
     def forget(self, before: int) -> None:
-        """Drop what was made before a phase: its recorded labels have come."""
+        """Drop the labels made before a phase, whose recorded labels have been compared."""
         self._made = {key: labels for key, labels in self._made.items() if key[0] >= before}
 
 
 @dataclass
 class Fold:
-    """What came out of folding a bag."""
+    """The result of folding a bag."""
 
     core: Labeller
     run: RunSpec
     settings: Settings
-    phases: int  # learnt from or taken in
+    phases: int  # learnt from or received
     losses: list[tuple[int, float]]  # (gradient steps taken, mean loss of the phase)
-    refused: Counter[str]  # records that could not be taken in, by topic
+    refused: Counter[str]  # records that were refused, by topic
     recorded: Recorded
 
 
@@ -80,7 +80,7 @@ def fold(
     run: RunSpec,
     settings: Settings,
     folder: Path | None,
-    say: Callable[[str], None] = lambda text: None,
+    report: Callable[[str], None] = lambda text: None,
     progress: Callable[[int, int], None] = lambda phase, phases: None,
     checkpoint: str = '',
     frozen: bool = False,
@@ -89,59 +89,59 @@ def fold(
 
     Args:
         bag: the bag.
-        run: which of the bag's runs.
-        settings: the run's own, or changed ones: then what is learnt differs.
-        folder: where checkpoints go; None keeps none.
-        say: is told what was refused, and why.
-        progress: is told the phases that are done, and how many the run has.
-        checkpoint: the saved model that the run started from; empty: it had none.
-        frozen: whether that one only labelled.
+        run: one of the bag's runs.
+        settings: the run's own, or changed ones, with which the result differs.
+        folder: for checkpoints; None keeps none.
+        report: called with each refused record and the reason.
+        progress: called with the number of phases done and that of the run.
+        checkpoint: the saved model that the run started from; empty if it had none.
+        frozen: whether that model only labelled.
 
     Raises:
         CheckpointError: there is no such checkpoint.
-        FitError: something that a commit names is not in the bag.
+        FitError: the bag lacks records that a commit names.
         RewardModelError: the checkpoint is of another method, size or shape, or training has
             diverged.
     """
     torch.set_num_threads(settings.threads)
     core = Labeller(run, settings, NODE, folder, checkpoint, frozen)
-    found = Fold(core, run, settings, 0, [], core.refused, Recorded())
+    folded = Fold(core, run, settings, 0, [], core.refused, Recorded())
     kinds = (*core.subscribes, StepRewards)
     work = core.work()
     ours = (entry for entry in bag.entries(kinds) if entry.record.run_id == run.run_id)
     for entry in causal(ours, settings.lag):
         record = entry.record
         if isinstance(record, StepRewards):
-            found.recorded.recorded(record)
+            folded.recorded.recorded(record)
             continue
         try:
             core.receive(record)
-        except RecordError as error:  # as in the run: refused, said, counted
-            found.refused[TOPICS[entry.kind]] += 1
-            say(f'{entry.place}: {error}')
+        except RecordError as error:  # as in the run: refused, reported, counted
+            folded.refused[TOPICS[entry.kind]] += 1
+            report(f'{entry.place}: {error}')
         if isinstance(record, Commit):
-            _work(work, found)
+            _work(work, folded)
             if core.missing is not None:
                 raise FitError(
                     f'{bag.path}: phase {core.missing} of run {run.run_id!r} is committed, but '
-                    f'not all that belongs to it is in the bag: {found.phases} phases were '
-                    'folded. `codetr bag verify` says what is missing; --schedule epochs fits '
+                    f'not all that belongs to it is in the bag: {folded.phases} phases were '
+                    'folded. `codetr bag verify` names what is missing; --schedule epochs fits '
                     'on what is there'
                 )
-            found.phases = record.phase + 1
-            found.recorded.forget(record.phase - settings.lag)
-            progress(found.phases, settings.phases)
+            folded.phases = record.phase + 1
+            folded.recorded.forget(record.phase - settings.lag)
+            progress(folded.phases, settings.phases)
     core.close()
-    return found
+    return folded
 
 
-def _work(work: Iterator[list[Record] | None], found: Fold) -> None:
-    """Let the core do all that it can."""
+def _work(work: Iterator[list[Record] | None], folded: Fold) -> None:
+    """Let the core do all the work that it can."""
     while (records := next(work)) is not None:
         for record in records:
             if isinstance(record, StepRewards):
-                found.recorded.made(record)
+                folded.recorded.made(record)
             elif isinstance(record, Metrics):
-                said = dict(zip(record.names, record.values.tolist(), strict=True))
-                if 'reward_loss' in said:
-                    found.losses.append((int(said['gradient_steps']), said['reward_loss']))
+                metrics = dict(zip(record.names, record.values.tolist(), strict=True))
+                if 'reward_loss' in metrics:
+                    folded.losses.append((int(metrics['gradient_steps']), metrics['reward_loss']))

@@ -18,13 +18,13 @@ from codetr_ros.system.files import atomic_write
 
 _TRUE, _INFERRED, _GREY = '#1f5fa8', '#b8561c', '#555'
 _MOST_POINTS = 5000
-"""Points of a scatter plot; of more every n-th is shown, and the caption says so."""
+"""The most points of a scatter plot; of more, every n-th is shown, as the caption states."""
 
 Axes = Any  # matplotlib has no types
 
 
 def title(summary: Mapping[str, Any]) -> str:
-    """What fit it was, in a line."""
+    """The fit in a line."""
     return (
         f'{summary["method"]} fitted to {summary["task"]}, {summary["delay"]} steps per score, '
         f'schedule {summary["schedule"]}'
@@ -93,7 +93,7 @@ def _judged(summary: Mapping[str, Any], judged: Judgement) -> list[Block]:
 
 
 def _png(size: tuple[float, float], draw: Callable[[Any], None]) -> bytes:
-    # Without pyplot: no display, and no state that outlives the picture.
+    # Without pyplot there is no display, and no state that outlives the picture.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -148,8 +148,8 @@ def draw_composites(judged: Judgement) -> bytes:
 
     def draw(figure: Any) -> None:
         axes = figure.subplots()
-        said = 'R² not defined' if r2 is None else f'R² {r2:.3f}'
-        _scatter(axes, judged.values, predicted, said)
+        caption = 'R² not defined' if r2 is None else f'R² {r2:.3f}'
+        _scatter(axes, judged.values, predicted, caption)
         axes.set_xlabel('true composite reward of a segment')
         axes.set_ylabel('predicted')
         low, high = float(judged.values.min()), float(judged.values.max())
@@ -160,7 +160,7 @@ def draw_composites(judged: Judgement) -> bytes:
 
 def draw_steps(judged: Judgement) -> bytes:
     """Inferred against true step rewards, as a PNG."""
-    said = [
+    correlations = [
         f'{name.replace("_", " ")} {judged.metrics[name]:.3f}'
         for name in ('pearson', 'spearman', 'within_pearson')
         if judged.metrics[name] is not None
@@ -168,18 +168,18 @@ def draw_steps(judged: Judgement) -> bytes:
 
     def draw(figure: Any) -> None:
         axes = figure.subplots()
-        _scatter(axes, judged.true, judged.labels, ', '.join(said) or 'no variance')
+        _scatter(axes, judged.true, judged.labels, ', '.join(correlations) or 'no variance')
         axes.set_xlabel('true step reward')
         axes.set_ylabel('inferred step reward')
 
     return _png((5, 4.5), draw)
 
 
-def _scatter(axes: Axes, x: Any, y: Any, said: str) -> None:
+def _scatter(axes: Axes, x: Any, y: Any, caption: str) -> None:
     every = -(-len(x) // _MOST_POINTS)
     shown = '' if every == 1 else f', one of {every} points shown'
     axes.scatter(x[::every], y[::every], s=6, alpha=0.4, color=_TRUE, lw=0)
-    axes.set_title(f'{said}{shown}', fontsize=10)
+    axes.set_title(f'{caption}{shown}', fontsize=10)
     axes.grid(alpha=0.3)
 
 

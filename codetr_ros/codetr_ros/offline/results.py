@@ -1,4 +1,4 @@
-"""What a fit leaves behind: its folder, its summary, what it says at the end."""
+"""The results of a fit: its folder, its summary, and the table that it prints at the end."""
 
 import dataclasses
 import json
@@ -41,12 +41,12 @@ def make_folder(path: Path) -> Path:
 
 
 def peak_mb() -> float:
-    """The most memory that this process has had so far [MB]."""
+    """The most memory that this process has used so far [MB]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def live_digest(bag: Bag) -> str | None:
-    """The digest that the run itself ended with, where the bag still lies in the run's folder.
+    """The digest that the run itself ended with, if the bag still lies in the run's folder.
 
     Raises:
         RunFolderError: the run's summary cannot be read.
@@ -55,17 +55,17 @@ def live_digest(bag: Bag) -> str | None:
     if not path.is_file():
         return None
     try:
-        said = json.loads(path.read_text())
+        summary = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise RunFolderError(
             f'{path} cannot be read as JSON ({error}): move the bag elsewhere'
         ) from None
-    found = said.get(DIGEST) if isinstance(said, dict) else None
-    return found if isinstance(found, str) else None
+    digest = summary.get(DIGEST) if isinstance(summary, dict) else None
+    return digest if isinstance(digest, str) else None
 
 
 def _common(
-    index: Index, found: Stretches, settings: Settings, fit: FitSettings, judged: Judgement | None
+    index: Index, data: Stretches, settings: Settings, fit: FitSettings, judged: Judgement | None
 ) -> dict[str, Any]:
     sources = sorted({f'{key.run_id}/{key.source}' for key, _ in index.episodes})
     return {
@@ -83,13 +83,13 @@ def _common(
             + (', ...' if len(sources) > 8 else ''),
             'observation size': index.observation_size,
             'action size': index.action_size,
-            'episodes': len({(s.key, s.episode) for s in found.found}),
+            'episodes': len({(s.key, s.episode) for s in data.usable}),
             'steps': index.steps,
-            'steps that no score covers': found.unscored,
-            'scored segments': sum(len(s.segments.firsts) for s in found.found),
+            'steps that no score covers': data.unscored,
+            'scored segments': sum(len(s.segments.firsts) for s in data.usable),
         },
         'metrics': judged.metrics if judged else dict.fromkeys(MEASURES),
-        'skipped': {name: n for name, n in found.skipped.items() if n},
+        'skipped': {name: n for name, n in data.skipped.items() if n},
         'notes': index.notes,
         'peak_rss_mb': peak_mb(),
     }
@@ -98,7 +98,7 @@ def _common(
 def of_phases(
     folded: Fold,
     index: Index,
-    found: Stretches,
+    data: Stretches,
     own: Settings,
     fit: FitSettings,
     judged: Judgement | None,
@@ -110,9 +110,9 @@ def of_phases(
     changed = {
         name: value for name, value in folded.settings.flat().items() if own.flat()[name] != value
     }
-    said = _common(index, found, folded.settings, fit, judged)
-    said['skipped'] |= {f'{topic} refused': n for topic, n in folded.refused.items()}
-    return said | {
+    summary = _common(index, data, folded.settings, fit, judged)
+    summary['skipped'] |= {f'{topic} refused': n for topic, n in folded.refused.items()}
+    return summary | {
         'run_id': folded.run.run_id,
         'changed_settings': changed,
         'phases': folded.phases,
@@ -130,22 +130,22 @@ def of_phases(
 def of_epochs(
     fitted: Fitted,
     index: Index,
-    found: Stretches,
+    data: Stretches,
     settings: Settings,
     fit: FitSettings,
     judged: Judgement,
 ) -> dict[str, Any]:
     """The summary of a fit on all of the data."""
-    said = _common(index, found, settings, fit, judged)
+    summary = _common(index, data, settings, fit, judged)
     held = fitted.held_out
-    said['data'] |= {
-        'held out': f'{len(held.stretches)} of {len(found.found)} stretches, '
+    summary['data'] |= {
+        'held out': f'{len(held.stretches)} of {len(data.usable)} stretches, '
         f'{held.memory.steps} steps, {len(held.memory.segments.ids())} segments',
         'steps held in memory at most': f'{fitted.most_steps} of memory_steps = '
         f'{settings.memory_steps}, {held.memory.bytes_per_step} bytes each',
         'times that the bags were read': 1 + fitted.reads,
     }
-    return said | {
+    return summary | {
         'gradient_steps': fitted.method.gradient_steps,
         'curve': [dataclasses.asdict(check) for check in fitted.curve],
         'best': dataclasses.asdict(fitted.best) if fitted.best else None,
@@ -165,11 +165,11 @@ def write(folder: Path, summary: Mapping[str, Any]) -> None:
 
 
 def rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The few facts that people look for first, for the page and for the terminal."""
-    found = [('gradient steps', str(summary['gradient_steps']))]
+    """The main facts, for the page and for the terminal."""
+    facts = [('gradient steps', str(summary['gradient_steps']))]
     if summary['schedule'] == 'phases':
         labels = summary['recorded_labels']
-        found += [
+        facts += [
             ('phases', f'{summary["phases"]} of {summary["phases_of_the_run"]}'),
             (
                 'labels in the bag',
@@ -178,9 +178,9 @@ def rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ]
         if live := summary['live_' + DIGEST]:
             same = 'the same weights' if live == summary[DIGEST] else f'no, it ended with {live}'
-            found.append(('as the run itself', same))
+            facts.append(('as the run itself', same))
     else:
-        found.append(('ended', summary['stopped']))
+        facts.append(('ended', summary['stopped']))
     metrics = summary['metrics']
     for name, key in (
         ('composite R²', 'composite_r2'),
@@ -189,11 +189,11 @@ def rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ('Spearman', 'spearman'),
     ):
         value = 'not known' if metrics[key] is None else f'{metrics[key]:.3f}'
-        found.append((name, f'{value} {summary["judged_on"]}'))
+        facts.append((name, f'{value} {summary["judged_on"]}'))
     skipped = sum(summary['skipped'].values())
     what = f': {", ".join(f"{n} {name}" for name, n in summary["skipped"].items())}'
     return [
-        *found,
+        *facts,
         ('skipped', f'{skipped}{what if skipped else ""}'),
         ('reward model sha256', str(summary[DIGEST])),
         ('time', f'{summary["wall_s"]:.1f} s'),
@@ -202,7 +202,7 @@ def rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def show(summary: Mapping[str, Any], folder: Path, console: Console) -> None:
-    """Print what came out of a fit."""
+    """Print the results of a fit."""
     console.print()
-    for name, said in (*rows(summary), ('report', str(folder / run_folder.REPORT))):
-        console.print(f'{name:<26}{said}', markup=False, soft_wrap=True)
+    for name, text in (*rows(summary), ('report', str(folder / run_folder.REPORT))):
+        console.print(f'{name:<26}{text}', markup=False, soft_wrap=True)

@@ -1,4 +1,4 @@
-"""What a fit needs to be told beyond the settings of a run."""
+"""The settings of a fit, beyond those of a run."""
 
 from typing import Literal
 
@@ -13,7 +13,7 @@ OF_NO_EFFECT = frozenset(
         *('record_relabels', 'relabel', 'relabel_steps', 'sac', 'hc', 'lirpg'),
     ]
 )
-"""Settings about simulating and about learning a policy: facts of the data, or of no interest."""
+"""Settings of simulating and of learning a policy: given by the data, or not used by a fit."""
 
 
 class FitSettings(Group):
@@ -30,9 +30,7 @@ class FitSettings(Group):
         le=0.5,
         description='share of the steps, in whole episodes, that is held out (epochs)',
     )
-    gradient_steps: int = Field(
-        5000, ge=1, le=10**8, description='gradient steps at most (epochs)'
-    )
+    gradient_steps: int = Field(5000, ge=1, le=10**8, description='most gradient steps (epochs)')
     check_every: int = Field(
         100, ge=1, le=10**6, description='gradient steps between two looks at the held-out loss'
     )
@@ -40,19 +38,19 @@ class FitSettings(Group):
         10,
         ge=1,
         le=10**6,
-        description='looks without a lower held-out loss after which the fit ends (epochs)',
+        description='looks without a lower held-out loss before the fit ends (epochs)',
     )
     part_steps: int = Field(
         1000,
         ge=1,
         le=10**8,
-        description='gradient steps on what is in memory before other episodes are read, where '
+        description='gradient steps on the episodes in memory before others are read, if '
         'memory_steps do not hold them all (epochs)',
     )
     stretch_steps: int = Field(
         10_000,
         ge=1,
         le=10**8,
-        description='longer episodes are cut between segments into parts of about so many steps, '
-        'each held out or not by itself (epochs)',
+        description='longer episodes are cut between segments into parts of about this many '
+        'steps, each held out or not by itself (epochs)',
     )

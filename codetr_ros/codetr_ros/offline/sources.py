@@ -1,4 +1,4 @@
-"""The bags that a command was given, and the runs that they say they are of."""
+"""The bags given to a command, and the runs that they hold."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,13 +11,13 @@ from codetr_ros.runs import folder as run_folder
 
 
 def open_bags(paths: Sequence[Path]) -> list[Bag]:
-    """Bags by their folder or file, or by the folder of the run that recorded it.
+    """Open bags by their folder or file, or by the folder of the run that recorded them.
 
     Raises:
         BagError: there is none, or it cannot be read.
         FitError: one was given twice.
     """
-    found = []
+    bags = []
     seen: dict[Path, Path] = {}
     for path in paths:
         bag = Bag(run_folder.bag_of(path))
@@ -27,34 +27,34 @@ def open_bags(paths: Sequence[Path]) -> list[Bag]:
                 'held out at the same time'
             )
         seen[real] = path
-        found.append(bag)
-    return found
+        bags.append(bag)
+    return bags
 
 
 def runs_of(bag: Bag) -> list[RunSpec]:
-    """The runs that a bag says it holds, in its order."""
-    found: dict[str, RunSpec] = {}
+    """The runs of a bag, in its order."""
+    runs: dict[str, RunSpec] = {}
     for entry in bag.entries((RunSpec,)):
         assert isinstance(entry.record, RunSpec)
-        found.setdefault(entry.record.run_id, entry.record)
-    return list(found.values())
+        runs.setdefault(entry.record.run_id, entry.record)
+    return list(runs.values())
 
 
 def one_run(bag: Bag, run_id: str | None) -> RunSpec:
-    """The run of a bag; of several the one with this id.
+    """The run of a bag; if it holds several, the one with this id.
 
     Raises:
-        FitError: there is none, or nobody said which.
+        FitError: there is none, or there are several and no id is given.
     """
     runs = runs_of(bag)
     names = ', '.join(run.run_id for run in runs)
     if not runs:
         raise FitError(
-            f'{bag.path} holds no RunSpec, so nobody knows how its run learnt: '
+            f'{bag.path} holds no RunSpec, so the settings of its run are not known: '
             'fit it with --schedule epochs'
         )
     if run_id is None and len(runs) > 1:
-        raise FitError(f'{bag.path} holds the runs {names}: say which one with --run')
+        raise FitError(f'{bag.path} holds the runs {names}: choose one with --run')
     for run in runs:
         if run_id in (None, run.run_id):
             return run
@@ -62,7 +62,7 @@ def one_run(bag: Bag, run_id: str | None) -> RunSpec:
 
 
 def settings_of(run: RunSpec, bag: Bag) -> Settings:
-    """The settings of a run, as its bag has them.
+    """The settings of a run, from its bag.
 
     Raises:
         SettingsError: this version does not know one of them.
