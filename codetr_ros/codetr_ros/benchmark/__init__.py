@@ -1,1 +1,1 @@
-"""Many runs under one protocol: cells made by a spec, run by workers, read by a report."""
+"""Do many runs under one protocol: a spec makes cells, workers run them, a report reads them."""

@@ -1,6 +1,6 @@
-"""Trivial anchors: what a random policy scores, and one that does nothing at all.
+"""Trivial anchors: the scores of a random policy and of one that does nothing at all.
 
-On Ant, standing still beats several published baselines: no score can be read without it.
+On Ant, standing still beats several published baselines, so every score needs it for comparison.
 """
 
 import json
@@ -22,25 +22,25 @@ from codetr_ros.system.files import atomic_write
 
 FILE = 'anchors.json'
 SEED = 0
-"""Of the start states and the random actions: those of the evaluations of seed 0."""
+"""Seed of the start states and the random actions: those of the evaluations of seed 0."""
 _NUMBERS = ('score_mean', 'score_std', 'true_return_mean', 'true_return_std', 'length_mean')
 
 Anchors = dict[tuple[str, str, int], dict[str, dict[str, float]]]
-"""By task, composite reward and delay: 'random' and 'zero', each with its numbers."""
+"""The numbers of 'random' and 'zero', by task, composite reward and delay."""
 
 
 def anchors(results: Sequence[Result], path: Path) -> Anchors:
-    """The anchors of every task, composite reward and delay; simulated once, kept in `path`.
+    """The anchors of every task, composite reward and delay; simulated once and kept in `path`.
 
     Raises:
         TaskError: a task cannot be made.
     """
     kept = read_json(path) or {}
     rewards: dict[tuple[str, int], dict[str, list[F64]]] = {}
-    found: Anchors = {}
+    known: Anchors = {}
     for result in results:
         key = (result.task, result.composite, result.delay)
-        if key in found:
+        if key in known:
             continue
         name = f'{result.task} {result.composite} {result.delay}'
         parameters = {
@@ -59,10 +59,10 @@ def anchors(results: Sequence[Result], path: Path) -> Anchors:
                 policy: _numbers(episodes, result.composite, result.delay, horizon, parameters)
                 for policy, episodes in rewards[which].items()
             }
-        found[key] = {policy: row[policy] for policy in ('random', 'zero')}
+        known[key] = {policy: row[policy] for policy in ('random', 'zero')}
     if rewards:
         atomic_write(path, json.dumps(kept, indent=1) + '\n')
-    return found
+    return known
 
 
 def simulate(task: str, episodes: int) -> dict[str, list[F64]]:
@@ -83,7 +83,7 @@ def simulate(task: str, episodes: int) -> dict[str, list[F64]]:
 
 
 def _episodes(environment: Environment, episodes: int, actions: Callable[[int], F32]) -> list[F64]:
-    found = []
+    earned = []
     for number in range(episodes):
         environment.reset(int(generator(SEED, 'evaluate', number).integers(2**31)))
         rewards = []
@@ -92,14 +92,14 @@ def _episodes(environment: Environment, episodes: int, actions: Callable[[int], 
             rewards.append(reward)
             if terminated:
                 break
-        found.append(np.array(rewards, np.float64))
-    return found
+        earned.append(np.array(rewards, np.float64))
+    return earned
 
 
 def _numbers(
     episodes: Sequence[F64], name: str, delay: int, horizon: int, parameters: dict[str, Any]
 ) -> dict[str, float]:
-    """As an evaluation has them: segments from the episode's start, a shorter last one too."""
+    """The numbers of an evaluation, whose segments cover an episode; the last may be shorter."""
     beta = parameters['beta']
     perfect = perfect_score(name, beta, delay, horizon, parameters['r_max'])
     scores = [

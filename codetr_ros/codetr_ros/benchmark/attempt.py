@@ -1,7 +1,6 @@
-"""One attempt at a cell: a process of its own, `codetr train --in-process`, and what it made.
+"""One attempt at a cell: its own process, `codetr train --in-process`, and the output of that.
 
-Local workers and Ray workers do the same thing with it, so that a cell is the same wherever it
-ran.
+Local workers and Ray workers use it alike, so that a cell is the same wherever it ran.
 """
 
 import errno
@@ -25,19 +24,19 @@ from codetr_ros.runs.run_summary import RunSummary
 from codetr_ros.system.files import atomic_write, sync_folder
 
 ERROR_LINES = 15
-"""Lines of its log that a failed cell is reported with."""
+"""Number of lines of its log in the report of a failed cell."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """What a worker must know of a cell.
+    """The facts that a worker needs of a cell.
 
     Attributes:
         cell: its name.
         settings_hash: the hash of its settings.
         steps: environment steps of its run.
         phases: phases of its run.
-        threads: threads that it takes.
+        threads: number of threads that its run takes.
     """
 
     cell: str
@@ -50,8 +49,8 @@ class Job:
 class Attempt:
     """A run of a cell that has been started.
 
-    Its process is killed when whoever started it dies: the thread that made this object must live
-    as long as the attempt.
+    Its process is killed when the thread that made this object ends. So that thread must live as
+    long as the attempt.
 
     Args:
         folder: the benchmark's folder.
@@ -75,8 +74,8 @@ class Attempt:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env={**os.environ, 'PYTHONUNBUFFERED': '1'},
-                start_new_session=True,  # Ctrl-C reaches only us
-                # one system call, looked up before
+                start_new_session=True,  # Ctrl-C reaches the runner only
+                # safe: one system call, looked up before the fork
                 preexec_fn=launcher.end_with_parent(signal.SIGKILL),  # noqa: PLW1509
             )
 
@@ -87,14 +86,14 @@ class Attempt:
 
     @property
     def seconds(self) -> float:
-        """Since its start."""
+        """Seconds since its start."""
         return time.monotonic() - self._began
 
     def finish(self) -> dict[str, Any]:
-        """Put what an ended process has made into the cell's place.
+        """Move the output of an ended process into the cell's place.
 
         Returns:
-            How it ended, as kept in `cells/<cell>.json`: `error` is None for a finished cell.
+            The ending, as kept in `cells/<cell>.json`: `error` is None for a finished cell.
         """
         code, job, folder = self._process.wait(), self.job, self._folder
         summary = read_summary(self._place)
@@ -109,22 +108,22 @@ class Attempt:
             **provenance(),
         }
         if not self._move_into_place():
-            self._remove()  # somebody was quicker; theirs stays
+            self._remove()  # another attempt finished first and stays
             return read_json(folder.ending(job.cell)) or ending
         os.replace(self._log, folder.log(job.cell))
         atomic_write(folder.ending(job.cell), json.dumps(ending, indent=1) + '\n')
         return ending
 
     def discard(self) -> None:
-        """End the process at once and remove what it has made."""
+        """End the process at once and remove its output."""
         if not self.over:
-            # not yet waited for, so its number cannot be anybody else's by now
+            # not yet waited for, so no other process can have its number
             os.killpg(self._process.pid, signal.SIGKILL)
             self._process.wait()
         self._remove()
 
     def _move_into_place(self) -> bool:
-        """Whether the cell's place now holds this run, or nothing where it made no folder."""
+        """Move the run into the cell's place; returns False if a finished run is there already."""
         folder, cell = self._folder, self.job.cell
         if not self._place.is_dir():
             return folder.state(cell, self.job.settings_hash) != 'finished'
@@ -163,7 +162,7 @@ class Attempt:
 
 
 def phases_in(run: Path) -> int:
-    """Phases that the learner of a run has saved a checkpoint of; 0 where there is none."""
+    """Phases up to the newest checkpoint of a run's learner; 0 if there is none."""
     numbers = [
         path.name.removeprefix('learner-')
         for path in (run / run_folder.CHECKPOINTS).glob('learner-*')
@@ -172,6 +171,6 @@ def phases_in(run: Path) -> int:
 
 
 def running(folder: Folder, cell: str) -> Path | None:
-    """The folder of the newest attempt at a cell, where there is one."""
-    found = [p for p in folder.attempts.glob(f'{cell}.????????') if p.is_dir()]
-    return max(found, key=lambda path: path.stat().st_mtime, default=None)
+    """The folder of the newest attempt at a cell, if there is one."""
+    folders = [p for p in folder.attempts.glob(f'{cell}.????????') if p.is_dir()]
+    return max(folders, key=lambda path: path.stat().st_mtime, default=None)

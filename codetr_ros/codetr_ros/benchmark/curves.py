@@ -32,7 +32,7 @@ _ROWS: Mapping[str, Callable[[Result], Sequence[Evaluation | RewardRecovery]]] =
 }
 
 Curve = tuple[list[int], list[float], list[float], list[float]]
-"""Steps; mean, lowest and highest of the seeds at each."""
+"""Steps, and at each the mean, lowest and highest value of the seeds."""
 
 
 def curve(results: Sequence[Result], key: str, of: str) -> Curve:
@@ -41,7 +41,7 @@ def curve(results: Sequence[Result], key: str, of: str) -> Curve:
     Args:
         results: cells that differ in their seed only.
         key: of the summary: `evaluations` or `reward_recovery`.
-        of: the number's name in a row.
+        of: name of the number in a row.
     """
     at: dict[int, list[float]] = defaultdict(list)
     for result in results:
@@ -64,9 +64,9 @@ def learning_curves(
 
     Args:
         results: the cells of one task, composite reward and delay.
-        order: all methods of the report: each has the same colour in every picture.
+        order: all methods of the report, so that each has the same colour in every picture.
         anchors: numbers of `random` and `zero`.
-        title: what the picture shows.
+        title: of the picture.
     """
     return _picture(
         results,
@@ -79,7 +79,7 @@ def learning_curves(
 
 
 def recovery_curves(results: Sequence[Result], order: Sequence[str], title: str) -> bytes | None:
-    """Correlation of labels and true rewards over training, as a PNG; None without any."""
+    """Correlation of labels and true rewards over training, as a PNG; None if there are none."""
     if not any(result.reward_recovery for result in results):
         return None
     names = {
@@ -97,7 +97,7 @@ def _picture(
     names: Mapping[str, str],
     anchors: Mapping[str, Mapping[str, float]],
 ) -> bytes:
-    # Without pyplot: no display, no state that outlives the picture.
+    # Without pyplot there is no display, and no state that outlives the picture.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -1,17 +1,17 @@
-"""The folder of a benchmark: what lies where, and what state each cell is in.
+"""The folder of a benchmark: its files, and the state of each cell.
 
-    spec.yaml                the spec, every setting spelt out; `codetr benchmark run` takes it
+    spec.yaml                the spec with every setting; `codetr benchmark run` takes it
     benchmark.json           all cells with the hash of their settings; where and when it was run
     cells/<cell>.yaml        the cell's settings
-    cells/<cell>.log         what its last run printed
-    cells/<cell>.json        how its last run ended
+    cells/<cell>.log         the output of its last run
+    cells/<cell>.json        the ending of its last run
     <cell>/                  the folder of its run, once it has ended
     attempts/                runs that have not ended
-    aside/                   what lay in the place of a cell without having been finished
+    aside/                   unfinished runs that lay in the place of a cell
 
-A run works in `attempts/`, under a name that no other run has, and is renamed into its place when
-it has ended: so a cell is there whole or not at all, and whoever outlives its runner writes into
-no place that matters.
+A run works in `attempts/`, under a unique name, and is renamed into its place when it has ended.
+So a cell is there whole or not at all, and a process that outlives its runner writes into no place
+that matters.
 """
 
 import fcntl
@@ -47,13 +47,13 @@ State = Literal['finished', 'failed', 'missing']
 
 
 def finished(summary: RunSummary | None, settings_hash: str) -> bool:
-    """Whether a run's summary says that all of it was done, under the settings of this hash."""
+    """Whether a run is complete by its summary, under the settings of this hash."""
     return summary is not None and summary.settings_hash == settings_hash and summary.complete
 
 
 def read_summary(run: Path) -> RunSummary | None:
-    """The summary in the folder of a run; None where there is none, or none that can be read: its
-    cell is not finished.
+    """The summary in the folder of a run; None if it is missing or cannot be read, and so its cell
+    is not finished.
     """
     try:
         return run_summary.read(run / run_folder.SUMMARY)
@@ -62,43 +62,43 @@ def read_summary(run: Path) -> RunSummary | None:
 
 
 def read_json(path: Path) -> dict[str, Any] | None:
-    """The JSON object in a file; None where there is no file or no such object in it."""
+    """The JSON object in a file; None if there is no file or no such object in it."""
     try:
-        found = json.loads(path.read_text())
+        data = json.loads(path.read_text())
     except (OSError, ValueError):
         return None
-    return found if isinstance(found, dict) else None
+    return data if isinstance(data, dict) else None
 
 
 class Folder:
     """The folder of one benchmark.
 
     Args:
-        path: the folder; need not exist yet.
+        path: the folder, which need not exist yet.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path.absolute()
 
     def settings(self, cell: str) -> Path:
-        """The cell's settings."""
+        """The file of the cell's settings."""
         return self.path / CELLS / f'{cell}.yaml'
 
     def log(self, cell: str) -> Path:
-        """What its last run printed."""
+        """The file of its last run's output."""
         return self.path / CELLS / f'{cell}.log'
 
     def ending(self, cell: str) -> Path:
-        """How its last run ended."""
+        """The file of its last run's ending."""
         return self.path / CELLS / f'{cell}.json'
 
     def run(self, cell: str) -> Path:
-        """Its run's folder."""
+        """The folder of its run."""
         return self.path / cell
 
     @property
     def attempts(self) -> Path:
-        """Where runs work."""
+        """The folder in which runs work."""
         return self.path / ATTEMPTS
 
     def summary(self, cell: str) -> RunSummary | None:
@@ -106,38 +106,38 @@ class Folder:
         return read_summary(self.run(cell))
 
     def state(self, cell: str, settings_hash: str) -> State:
-        """What has become of a cell whose settings have this hash."""
+        """The state of a cell whose settings have this hash."""
         if finished(self.summary(cell), settings_hash):
             return 'finished'
-        said = read_json(self.ending(cell))
-        failed = said and said['settings_hash'] == settings_hash and said['error']
+        ending = read_json(self.ending(cell))
+        failed = ending and ending['settings_hash'] == settings_hash and ending['error']
         return 'failed' if failed else 'missing'
 
     def error(self, cell: str) -> str:
-        """Why the cell's last run failed, in a line."""
-        said = read_json(self.ending(cell))
-        return str(said['error']) if said and said['error'] else 'unknown'
+        """The error of the cell's last run, in a line."""
+        ending = read_json(self.ending(cell))
+        return str(ending['error']) if ending and ending['error'] else 'unknown'
 
     def index(self) -> dict[str, Any]:
-        """What `benchmark.json` says.
+        """The content of `benchmark.json`.
 
         Raises:
-            BenchmarkError: there is none, so this is not the folder of a benchmark, or it is
+            BenchmarkError: it is missing, so this is not the folder of a benchmark, or it is
                 damaged.
         """
         path = self.path / INDEX
         if not path.is_file():
             raise BenchmarkError(
                 f'{self.path} is not the folder of a benchmark, it has no {INDEX}: '
-                'give the folder that `codetr benchmark run` was given with --out'
+                'give the folder that was the --out of `codetr benchmark run`'
             )
-        found = read_json(path)
-        if found is None or found.get('format') != FORMAT:
+        index = read_json(path)
+        if index is None or index.get('format') != FORMAT:
             raise BenchmarkError(
                 f'{path} is damaged or of another version: it must be a JSON object with '
                 f'format {FORMAT}'
             )
-        return found
+        return index
 
     @contextmanager
     def alone(self) -> Iterator[None]:
@@ -190,7 +190,7 @@ class Folder:
                 )
 
     def _difference(self, cell: Cell) -> str:
-        """The settings in which the cell differs from what lies in the folder."""
+        """The settings in which the cell differs from that in the folder."""
         path = self.settings(cell.name)
         try:
             there = yaml.safe_load(path.read_text())
@@ -203,11 +203,11 @@ class Folder:
         return '; '.join(shown) + ('; ...' if len(names) > 4 else '')
 
     def prepare(self, spec: Spec, session: Mapping[str, Any]) -> None:
-        """Write down what is to be run and by whom.
+        """Write the spec, the index and the settings of the cells.
 
         Args:
             spec: the benchmark, checked.
-            session: who runs it, where and how; kept beside those before.
+            session: of this run of the benchmark; kept beside those before.
         """
         (self.path / CELLS).mkdir(exist_ok=True)
         self.attempts.mkdir(exist_ok=True)
@@ -224,17 +224,17 @@ class Folder:
         atomic_write(self.path / INDEX, json.dumps(index, indent=1) + '\n')
 
     def clear_attempts(self) -> int:
-        """Remove what was left unfinished by runners or nodes that are gone; how many runs."""
+        """Remove runs that dead runners or nodes left unfinished; returns how many."""
         logs = list(self.attempts.glob('*.log'))  # one for each
         for log in logs:
-            # whoever is cut off from the rest may still write there: a later runner tries again
+            # a node that is cut off may still write there: a later runner tries again
             shutil.rmtree(log.with_suffix(''), ignore_errors=True)
             if not log.with_suffix('').exists():
                 log.unlink()
         return len(logs)
 
     def set_aside(self, cell: str) -> Path | None:
-        """Move away what lies in the cell's place, if anything; where to."""
+        """Move away the run in the cell's place, if any; returns its new path."""
         place = self.run(cell)
         if not place.exists():
             return None
@@ -253,7 +253,7 @@ def _row(cell: Cell) -> dict[str, Any]:
 
 
 def session(spec: Path, workers: int, ray: str | None) -> dict[str, Any]:
-    """Who runs a benchmark: versions, commit, machine, time."""
+    """The record of one run of a benchmark: versions, commit, machine, time."""
     return {
         'began': time.strftime('%Y-%m-%dT%H:%M:%S%z'),
         'spec': str(spec),
@@ -286,7 +286,7 @@ def _commit(folder: Path) -> str | None:
 
     commit = git('rev-parse', 'HEAD')
     if commit is None or git('ls-files', '--', str(folder)) in (None, ''):
-        return None  # some other checkout that happens to be around an installed package
+        return None  # another checkout that happens to surround an installed package
     return commit + ('+changes' if git('status', '--porcelain', '--', str(folder.parent)) else '')
 
 

@@ -1,4 +1,4 @@
-"""How a benchmark is doing: a display that changes in place on a terminal, else plain lines."""
+"""The progress of a benchmark: a display that changes in place on a terminal, else plain lines."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -16,15 +16,15 @@ from codetr_ros.runs.progress import duration
 
 
 class Overview(Display):
-    """Shows which cells are done, run, have failed, and how long it will take.
+    """Shows which cells are done, running or failed, and how long the rest will take.
 
     Args:
         folder: the benchmark's folder.
         jobs: the cells to be run.
-        done: how many were finished before.
-        stream: where to show it.
+        done: number of cells that were finished before.
+        stream: shows the display.
         live: change the display in place; by default if `stream` is a terminal.
-        clock: seconds, never going back.
+        clock: monotonic seconds.
     """
 
     plain_every = 30.0
@@ -43,20 +43,20 @@ class Overview(Display):
         super().__init__(stream, live, clock)
         self._total = len(jobs) + done
         self._steps_total = sum(job.steps for job in jobs)
-        self._steps_done = 0  # of cells that have ended since the beginning, failed ones included
+        self._steps_done = 0  # of cells that have ended since the start, failed ones included
         self._done = done
         self._running: dict[str, tuple[Job, float]] = {}  # by cell, with its start
         self.failed: dict[str, str] = {}
-        """Cells that failed, and why."""
+        """Errors of the failed cells, by cell."""
 
     def started(self, job: Job) -> None:
-        """A cell begins; one that begins again is counted once."""
+        """Show that a cell begins; one that begins again is counted once."""
         self._running[job.cell] = (job, self._clock())
         if self._live is None:
             self.log(f'begun: {job.cell}')
 
     def ended(self, job: Job, ending: Mapping[str, Any]) -> None:
-        """A cell has ended, as `Attempt.finish` says."""
+        """Show that a cell has ended, by the ending that `Attempt.finish` returns."""
         _, began = self._running.pop(job.cell)
         self._steps_done += job.steps
         took = duration(self._clock() - began)
@@ -74,13 +74,13 @@ class Overview(Display):
         self.log(self._counts() + (f'; running: {shown}' if shown else ''))
 
     def _progress(self) -> list[tuple[str, float, float]]:
-        """Each running cell with the share of its phases learnt from and its seconds so far."""
-        found = []
+        """Each running cell with the share of its phases that are done and its seconds so far."""
+        progress = []
         for cell, (job, began) in self._running.items():
             place = running(self._folder, cell)
             share = phases_in(place) / job.phases if place else 0.0
-            found.append((cell, min(share, 1.0), self._clock() - began))
-        return found
+            progress.append((cell, min(share, 1.0), self._clock() - began))
+        return progress
 
     def _steps(self) -> float:
         shares = {cell: share for cell, share, _ in self._progress()}
@@ -90,7 +90,7 @@ class Overview(Display):
 
     @property
     def seconds_left(self) -> float | None:
-        """Estimate from the steps per second since the beginning; None while there are none."""
+        """Estimate from the steps per second since the start; None while there are none."""
         steps, spent = self._steps(), self._clock() - self._began
         return (self._steps_total - steps) * spent / steps if steps and spent else None
 

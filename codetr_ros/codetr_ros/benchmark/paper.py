@@ -1,4 +1,4 @@
-"""The paper's own numbers, and everything known in which ours differ from them.
+"""The paper's own numbers, and all known differences from ours.
 
 The supplement's Table 2: scores on Ant-v2, delays from 25 to 200, three trials.
 """
@@ -9,7 +9,7 @@ from typing import Any
 from codetr_ros import config
 
 TASKS = ('Ant-v4',)
-"""Tasks whose scores may be put beside the paper's: Ant-v4 stands in for Ant-v2."""
+"""Tasks whose scores may be compared with the paper's: Ant-v4 stands in for Ant-v2."""
 
 TABLE_2: dict[str, dict[str, tuple[float, float]]] = {
     'sum': {
@@ -65,30 +65,30 @@ DIFFERENCES = (
     'sum_square and square_sum keep signs, |r| r and |S| S: inferred from negative scores in the '
     'paper.',
     'A cell there spans "delayed steps ranging from 25 to 200"; that it is the mean over them is '
-    'inferred. Which delays those are is not said.',
+    'inferred. The paper does not name those delays.',
     'The number in brackets is not explained in the paper. Here it is the sample standard '
     'deviation over seeds of the mean over delays.',
-    'Which evaluation makes the score is not said. Here it is the last one.',
-    "Bold: what the pairs of the paper's t-test are is not said. Here they are (seed, delay).",
-    'The reward model learns per phase (1000 steps) here, per new trajectory there; early in '
-    'training, when episodes are short, that differs.',
+    'The paper does not state which evaluation gives the score. Here it is the last one.',
+    'Bold: the paper does not define the pairs of its t-test. Here they are (seed, delay).',
+    'The reward model learns once per phase (1000 steps) here, once per new trajectory there. '
+    'That differs early in training, when episodes are short.',
     'Composite rewards are divided by one positive constant of the warm-up (target_scale) before '
-    'anything learns from them; the paper does not mention it. Not so with ircr, which brings '
-    'them to between 0 and 1, and lirpg, which divides by a running deviation.',
-    'What step reward CoDeTr stores (the weighted one here), the scale of its attention logits, '
-    'its context and its initial weights are not stated there: see the settings and '
+    'anything learns from them; the paper does not mention it. Exceptions: ircr scales them to '
+    'between 0 and 1, and lirpg divides by a running deviation.',
+    'The paper does not state which step reward CoDeTr stores (the weighted one here), the scale '
+    'of its attention logits, its context or its initial weights: see the settings and '
     'config/presets.',
-    'All methods and SAC were written anew from their papers; how each differs from published '
-    "code is in its module's docstring.",
+    'All methods and SAC were written anew from their papers; the docstring of each module lists '
+    'its differences from published code.',
     'A last segment that an early end cuts short is scored like any other; the paper is silent.',
 )
-"""What is known to differ, or was decided because the paper is silent."""
+"""Known differences, and decisions where the paper is silent."""
 
 
 def settings_differences(settings: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
     """Settings in which a cell differs from the preset `paper`: name, there, here.
 
-    What a benchmark varies (task, composite, delay, method, seed) is left out.
+    The axes of a benchmark (task, composite, delay, method, seed) are left out.
     """
     there = dict(config.flatten(config.load('paper').model_dump(mode='json')))
     varied = ('task', 'composite', 'delay', 'method', 'seed')

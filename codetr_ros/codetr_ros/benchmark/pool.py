@@ -1,4 +1,4 @@
-"""Cells on this machine, several processes at a time."""
+"""Run cells on this machine, several processes at a time."""
 
 import time
 from collections import deque
@@ -18,14 +18,14 @@ def run(
     overview: Overview,
     stopped: Callable[[], bool],
 ) -> None:
-    """Run cells until all have ended or somebody wants to stop; no process is left then.
+    """Run cells until all have ended or a stop is requested; leaves no process.
 
     Args:
         folder: the benchmark's folder, prepared.
         jobs: the cells, in the order in which they begin.
-        workers: how many at a time.
-        overview: is told what begins and ends.
-        stopped: whether to stop: what runs then is lost, what has ended is kept.
+        workers: number of cells at a time.
+        overview: shows which cells begin and end.
+        stopped: whether to stop; running cells are then lost, ended ones are kept.
     """
     waiting, attempts = deque(jobs), list[Attempt]()
     try:

@@ -1,8 +1,8 @@
-"""Cells on a Ray cluster: the same attempts as tasks, run again when a node dies.
+"""Run cells on a Ray cluster: each attempt is a task, and runs again when a node dies.
 
 Every node has this package installed and sees the benchmark's folder under the same path. Ray
-(requirements-ray.txt) is imported here and nowhere else, and only when it is asked for. It pickles
-what goes to its workers: a folder's name and a `Job`.
+(requirements-ray.txt) is imported only here, and only for `--ray`. It pickles the arguments of its
+workers: a folder's name and a `Job`.
 """
 
 import importlib.util
@@ -23,31 +23,30 @@ from codetr_ros.benchmark.spec import BenchmarkError
 from codetr_ros.system.files import atomic_write
 
 RETRIES = 3
-"""How often a cell begins again after it has lost its node."""
+"""How often a cell that loses its node begins again."""
 PATIENCE = 300.0
 """Seconds to wait for a node that has enough cores, once none is left."""
-_CANCEL = 20.0  # seconds for running cells to end when somebody wants to stop
-_CONNECT = 5.0  # seconds until a cluster must have answered
+_CANCEL = 20.0  # seconds for running cells to end after a stop is requested
+_CONNECT = 5.0  # seconds within which a cluster must answer
 _POLL = 0.5  # seconds between looks at the cluster and the folder
 
 
 def check(address: str) -> None:
-    """Refuse to go on without Ray, or without anybody at the address.
+    """Check that Ray is installed and that something answers at the address.
 
     Raises:
-        BenchmarkError: it is not installed, or the address is none of a cluster; says how to mend
-            that.
+        BenchmarkError: it is not installed, or no cluster answers; names the remedy.
     """
     if importlib.util.find_spec('ray') is None:
         raise BenchmarkError(
             '--ray: Ray is not installed. Install it with `pip install -r requirements-ray.txt`, '
-            'on every node, or leave --ray away and give --workers'
+            'on every node, or use --workers instead of --ray'
         )
     if address in ('auto', 'local'):
         return
     host, _, port = address.rpartition(':')
     try:
-        # Ray itself would try for minutes
+        # Ray itself would keep trying for minutes
         socket.create_connection((host.strip('[]'), int(port)), _CONNECT).close()
     except (OSError, ValueError, OverflowError) as error:
         raise BenchmarkError(_unreachable(address, error)) from None
@@ -67,14 +66,14 @@ def run(
     overview: Overview,
     stopped: Callable[[], bool],
 ) -> None:
-    """Run cells until all have ended or somebody wants to stop.
+    """Run cells until all have ended or a stop is requested.
 
     Args:
         folder: the benchmark's folder, prepared.
         jobs: the cells.
         address: of the cluster, as `ray.init` takes it.
-        overview: is told what begins and ends.
-        stopped: whether to stop: what runs then is lost, what has ended is kept.
+        overview: shows which cells begin and end.
+        stopped: whether to stop; running cells are then lost, ended ones are kept.
 
     Raises:
         BenchmarkError: the cluster cannot be reached, or has no node with as many cores as a cell
@@ -109,7 +108,7 @@ def run(
                 overview.tick()
         finally:
             _cancel(list(pending))
-            folder.clear_attempts()  # of nodes that have died
+            folder.clear_attempts()  # those of dead nodes
 
 
 @contextmanager
@@ -117,7 +116,7 @@ def _connected(address: str) -> Iterator[None]:
     import ray
 
     os.environ.setdefault('RAY_USAGE_STATS_ENABLED', '0')
-    before = signal.getsignal(signal.SIGTERM)  # which Ray takes for itself
+    before = signal.getsignal(signal.SIGTERM)  # Ray replaces this handler
     try:
         ray.init(address=address, log_to_driver=False, include_dashboard=_dashboard(address))
     except (ConnectionError, ValueError, RuntimeError) as error:
@@ -130,12 +129,12 @@ def _connected(address: str) -> Iterator[None]:
 
 
 def _dashboard(address: str) -> bool | None:
-    """No dashboard for a cluster of our own; of another's there is nothing to decide."""
+    """No dashboard for a cluster of our own; an existing cluster has decided already."""
     return False if address == 'local' else None
 
 
 class _Nodes:
-    """Whether the cluster has a node on which a cell can run at all."""
+    """Checks that the cluster has a node with enough cores for a cell."""
 
     def __init__(self, threads: int) -> None:
         self._threads = threads
@@ -145,7 +144,7 @@ class _Nodes:
         """Look at the nodes; give up after `patience` seconds without one.
 
         Raises:
-            BenchmarkError: there has been no node with enough cores for so long.
+            BenchmarkError: no node has had enough cores for that long.
         """
         import ray
 
@@ -160,7 +159,7 @@ class _Nodes:
 
 
 def _work(path: str, job: Job) -> dict[str, Any]:
-    """On a node: one attempt at a cell, from its beginning to its end."""
+    """Do one attempt at a cell on a node, from beginning to end."""
     folder = Folder(Path(path))
     if not folder.settings(job.cell).is_file():
         raise BenchmarkError(
@@ -168,7 +167,7 @@ def _work(path: str, job: Job) -> dict[str, Any]:
             'must share the folder given with --out, under the same path'
         )
     if folder.state(job.cell, job.settings_hash) == 'finished':
-        # done by a node that died before it could say so
+        # done by a node that died before it could report it
         return read_json(folder.ending(job.cell)) or {'error': None, 'log': None}
     attempt = Attempt(folder, job)
     try:
@@ -181,14 +180,14 @@ def _work(path: str, job: Job) -> dict[str, Any]:
 
 
 def _ending(folder: Folder, job: Job, task: Any) -> dict[str, Any]:
-    """What a task that is over has to say; that of a lost one is made here, and kept."""
+    """The ending of a finished task; that of a lost one is made here and saved."""
     import ray
 
     try:
-        found: dict[str, Any] = ray.get(task)
+        ending: dict[str, Any] = ray.get(task)
     except ray.exceptions.RayError as error:
         cause = error.cause if isinstance(error, ray.exceptions.RayTaskError) else error
-        found = {
+        ending = {
             'cell': job.cell,
             'settings_hash': job.settings_hash,
             'error': f'{type(cause).__name__}: {cause}'.strip().splitlines()[0],
@@ -197,12 +196,12 @@ def _ending(folder: Folder, job: Job, task: Any) -> dict[str, Any]:
             'wall_s': None,
             **provenance(),
         }
-        atomic_write(folder.ending(job.cell), json.dumps(found, indent=1) + '\n')
-    return found
+        atomic_write(folder.ending(job.cell), json.dumps(ending, indent=1) + '\n')
+    return ending
 
 
 def _cancel(tasks: list[Any]) -> None:
-    """End tasks: first asked, so that they remove what they began, then not."""
+    """End tasks: cancel them so that they remove their output, then kill those that are left."""
     import ray
 
     for task in tasks:

@@ -22,14 +22,14 @@ def write(paths: Sequence[Path], out: Path | None = None) -> tuple[Path, str]:
 
     Args:
         paths: their folders.
-        out: where the report goes; `report` in the first folder where not given.
+        out: folder of the report; by default `report` in the first folder.
 
     Returns:
         The report's folder, and its tables over delays as Markdown.
 
     Raises:
-        BenchmarkError: a folder is no benchmark's, or they cannot be compared.
-        TaskError: a task of which the trivial anchors are to be simulated cannot be made.
+        BenchmarkError: a folder is not a benchmark's, or the benchmarks cannot be compared.
+        TaskError: a task cannot be made to simulate its trivial anchors.
     """
     results = read(paths)
     first = Folder(paths[0])
@@ -68,7 +68,7 @@ def _r_max(results: Sequence[Result]) -> dict[str, float]:
 
 
 def _pictures(results: Sequence[Result], anchors: trivial.Anchors) -> Iterator[tuple[str, bytes]]:
-    """Each picture by its file name."""
+    """Yield each picture with its file name."""
     order = table.methods(results)
     for key, numbers in anchors.items():
         some = [r for r in results if (r.task, r.composite, r.delay) == key]
@@ -83,7 +83,7 @@ def _pictures(results: Sequence[Result], anchors: trivial.Anchors) -> Iterator[t
 
 
 def table_csv(rows: Sequence[table.Row]) -> str:
-    """A line for each method in each row, over several delays and each alone."""
+    """A line for each method in each row, over several delays and for each delay alone."""
     lines: list[dict[str, Any]] = []
     for row in rows:
         for entry in row.entries:
@@ -114,7 +114,7 @@ def table_csv(rows: Sequence[table.Row]) -> str:
 
 
 def cells_csv(results: Sequence[Result]) -> str:
-    """A line for each cell, whatever has become of it."""
+    """A line for each cell, whatever its state."""
     return _csv(
         [
             {

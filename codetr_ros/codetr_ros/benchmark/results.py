@@ -1,4 +1,4 @@
-"""What the cells of benchmarks have come to, read from their folders."""
+"""The results of the cells of benchmarks, read from their folders."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,18 +14,18 @@ from codetr_ros.runs.run_summary import Evaluation, RewardRecovery, RunSummary
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """A cell and what has become of it.
+    """A cell and its result.
 
     Attributes:
         cell: its name.
         folder: the benchmark that it belongs to.
-        task, composite, delay, method, seed: what it is.
-        settings: all of its settings, as they were when it was planned.
+        task, composite, delay, method, seed: its place in the benchmark.
+        settings: all of its settings, as planned.
         state: finished, failed or missing.
-        error: why it is not finished; empty where it is.
-        log: the end of what a failed cell printed.
+        error: why it is not finished; empty if it is.
+        log: the end of a failed cell's output.
         summary: of a finished cell.
-        commit: what it was run with, where that is known.
+        commit: of the code that ran it, if known.
     """
 
     cell: str
@@ -54,32 +54,32 @@ class Result:
 
     @property
     def evaluations(self) -> Sequence[Evaluation]:
-        """Those of a finished cell, in the order of training steps."""
+        """The evaluations of a finished cell, in the order of training steps."""
         return self.summary.evaluations if self.summary else ()
 
     @property
     def reward_recovery(self) -> Sequence[RewardRecovery]:
-        """How well labels agreed with true rewards at each evaluation of a finished cell."""
+        """The agreement of labels and true rewards at each evaluation of a finished cell."""
         return self.summary.reward_recovery if self.summary else ()
 
 
 def read(paths: Sequence[Path]) -> list[Result]:
-    """All cells of benchmarks, in the order of their specs.
+    """Read all cells of benchmarks, in the order of their specs.
 
     Raises:
-        BenchmarkError: a folder is no benchmark's, two of them have the same cell, or cells that
-            are to be compared have different settings.
+        BenchmarkError: a folder is not a benchmark's, two of them have the same cell, or cells
+            that are compared have different settings.
     """
-    found: dict[str, Result] = {}
+    by_cell: dict[str, Result] = {}
     for path in paths:
         for result in _read(Folder(path)):
-            if (other := found.get(result.cell)) is not None:
+            if (other := by_cell.get(result.cell)) is not None:
                 raise BenchmarkError(
                     f'cell {result.cell} is in {other.folder} and in {result.folder}: report '
                     'them one by one'
                 )
-            found[result.cell] = result
-    results = list(found.values())
+            by_cell[result.cell] = result
+    results = list(by_cell.values())
     _check(results)
     return results
 
@@ -111,8 +111,8 @@ def _read(folder: Folder) -> Iterator[Result]:
 
 
 def _check(results: Sequence[Result]) -> None:
-    """Cells of a task must be alike in all but composite reward, delay, method and seed: what they
-    came to is averaged and compared.
+    """Check that cells of a task differ only in composite reward, delay, method and seed, because
+    their results are averaged and compared.
     """
     first: dict[str, Result] = {}
     for result in results:

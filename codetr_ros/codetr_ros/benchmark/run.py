@@ -1,4 +1,4 @@
-"""Running a benchmark: what is still to be done, done, with an overview."""
+"""Run the unfinished cells of a benchmark, with an overview."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -24,25 +24,26 @@ def run(
 
     Args:
         spec: the benchmark.
-        path: the file that it was read from.
+        path: the file of the spec.
         out: its folder.
-        workers: cells at a time; on Ray, as many as its nodes have cores for.
+        workers: cells at a time; not used on Ray, which runs as many as its nodes have cores for.
         ray: address of a Ray cluster, `local` for one on this machine; None runs without Ray.
         retry_failed: run failed cells again.
-        stopped: whether somebody wants to stop.
+        stopped: whether a stop is requested.
 
     Returns:
-        The cells that have failed, now or before, and why.
+        The errors of the cells that have failed, now or before, by cell.
 
     Raises:
-        BenchmarkError: another spec's folder, another runner in it, no Ray or no cluster.
+        BenchmarkError: the folder is another spec's or has another runner in it, Ray is not
+            installed, or its cluster cannot be reached.
     """
     folder = Folder(out)
     folder.check(spec)
     if ray is not None:
         ray_pool.check(ray)
     with folder.alone():
-        folder.check(spec)  # nobody has changed it meanwhile, and nobody can from here on
+        folder.check(spec)  # another runner may have changed it before, but cannot from here on
         folder.prepare(spec, session(path, workers, ray))
         left = folder.clear_attempts()
         jobs, failed = _todo(spec, folder, retry_failed)
@@ -58,7 +59,7 @@ def run(
             overview.log('cells that failed before are run again with --retry-failed')
         for job in jobs:
             if (aside := folder.set_aside(job.cell)) is not None:
-                overview.log(f'{job.cell} is not finished: what was there is now {aside}')
+                overview.log(f'{job.cell} is not finished: its old folder is now {aside}')
         with overview:
             if ray is not None:
                 ray_pool.run(folder, jobs, ray, overview, stopped)
@@ -69,7 +70,7 @@ def run(
 
 
 def _todo(spec: Spec, folder: Folder, retry_failed: bool) -> tuple[list[Job], dict[str, str]]:
-    """The cells to be run, and those that have failed before and are not to be run again."""
+    """The cells to run, and the errors of failed cells that are not run again."""
     jobs: list[Job] = []
     failed: dict[str, str] = {}
     for cell in spec.cells:

@@ -12,7 +12,7 @@ from codetr_ros.benchmark.table import ORACLES, TABLE_DELAYS, Aggregate, Entry, 
 from codetr_ros.runs.document import Block, Bold, Heading, Items, Paragraph, Table
 
 NONE = '–'
-"""Where there is nothing to show."""
+"""Shown where there is no value."""
 
 
 def _number(value: float | None, digits: int) -> str:
@@ -91,14 +91,15 @@ def _reading() -> list[Block]:
                 f'A cell is the mean over the delays from {low} to {high} that were planned and '
                 'over seeds. That a cell of the paper is such a mean is inferred.',
                 'In brackets: sample standard deviation over seeds of the mean over delays; '
-                'nothing where there is one seed.',
-                f'Bold: the highest mean, and all that a paired t-test at {SIGNIFICANCE:.0%} over '
-                'pairs of seed and delay does not tell from it. Few pairs tell little apart. With '
-                'fewer than two pairs no test is possible: then only the highest mean is bold.',
+                'nothing if there is one seed.',
+                'Bold: the highest mean, and all that do not differ from it by a paired t-test at '
+                f'{SIGNIFICANCE:.0%} over pairs of seed and delay. Few pairs show few '
+                'differences. With fewer than two pairs no test is possible: then only the '
+                'highest mean is bold.',
                 f'{", ".join(ORACLES)} sees the rewards that no other method may see: it is '
-                'neither best nor compared.',
+                'never marked as best, nor compared.',
                 '[n of m, k failed]: only n of m cells have finished; the mean is over those, '
-                'which need not be the same delays and seeds as elsewhere.',
+                'whose delays and seeds may differ from those of other entries.',
                 'random, standing still: the trivial anchors, mean over the same delays.',
             ]
         )
@@ -117,7 +118,7 @@ def each_delay(alone: Sequence[Row]) -> list[Block]:
 
 
 def returns(together: Sequence[Row], alone: Sequence[Row]) -> list[Block]:
-    """True returns: what an episode earned in the task's own rewards."""
+    """True returns: the sum of the task's own rewards over an episode."""
     blocks: list[Block] = [
         Heading('True returns'),
         Paragraph(
@@ -185,7 +186,7 @@ def _interval(interval: tuple[float, float] | None) -> str:
     return NONE if interval is None else f'{interval[0]:.4f} to {interval[1]:.4f}'
 
 
-def anchors(found: Anchors) -> list[Block]:
+def anchors(known: Anchors) -> list[Block]:
     """Trivial policies."""
     lines: list[list[str | Bold]] = [
         [
@@ -195,14 +196,14 @@ def anchors(found: Anchors) -> list[Block]:
             *(f'{by[policy]["score_mean"]:.4f}' for policy in ('random', 'zero')),
             *(f'{by[policy]["true_return_mean"]:.1f}' for policy in ('random', 'zero')),
         ]
-        for (task, composite, delay), by in found.items()
+        for (task, composite, delay), by in known.items()
     ]
     head = ['task', 'composite', 'delay', 'random: score', 'standing still: score']
     return [
         Heading('Trivial anchors'),
         Paragraph(
-            'A uniformly random policy, and one that stands still (action 0). What does not beat '
-            'both has learnt nothing that counts.'
+            'A uniformly random policy, and one that stands still (action 0). A method that does '
+            'not beat both has learnt nothing that counts.'
         ),
         Table([*head, 'random: return', 'standing still: return'], lines),
     ]

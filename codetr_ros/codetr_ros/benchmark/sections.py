@@ -1,4 +1,4 @@
-"""The parts of a benchmark's report beside scores, each as blocks of a document."""
+"""The parts of a benchmark's report other than scores, each as blocks of a document."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -28,12 +28,12 @@ def _every(results: Sequence[Result], name: str) -> str:
 
 
 def title(results: Sequence[Result]) -> str:
-    """What was benchmarked, in a line."""
+    """The title of the report: the tasks."""
     return f'Benchmark: {_every(results, "task")}'
 
 
 def protocol(results: Sequence[Result]) -> list[Block]:
-    """What was run."""
+    """The methods, tasks and settings that were run, and the states of the cells."""
     counts = {state: sum(r.state == state for r in results) for state in _STATES}
     steps = ', '.join(map(str, dict.fromkeys(r.settings['steps'] for r in results)))
     episodes = ', '.join(map(str, dict.fromkeys(r.settings['evaluate_episodes'] for r in results)))
@@ -43,7 +43,7 @@ def protocol(results: Sequence[Result]) -> list[Block]:
             f'{_every(results, "composite")}; delays {_every(results, "delay")}; seeds '
             f'{_every(results, "seed")}; {steps} steps. Score: composite return of the last '
             f"evaluation's {episodes} episodes over that of an agent that earns r_max at every "
-            'step (1 is perfect, standing still need not be 0: see the anchors).'
+            'step (1 is perfect; standing still need not be 0: see the anchors).'
         ),
         Paragraph(
             f'{len(results)} cells: '
@@ -57,7 +57,7 @@ _STATES = ('finished', 'failed', 'missing')
 
 
 def recovery(results: Sequence[Result]) -> list[Block]:
-    """How far labels agree with true rewards at the end of training."""
+    """The agreement of labels and true rewards at the end of training."""
     order = methods(results)
     lines: list[list[str | Bold]] = []
     for key in dict.fromkeys((r.task, r.composite, r.delay) for r in results):
@@ -80,9 +80,9 @@ def recovery(results: Sequence[Result]) -> list[Block]:
         Paragraph(
             'Pearson correlation of the newest labels in memory with the true step rewards, each '
             "segment's mean removed from both: is credit right inside segments? Mean over seeds, "
-            f'lowest and highest in brackets; {NONE} where there are no labels, or labels that do '
-            'not vary within segments. Each method is measured on the steps that its own policies '
-            'took, so columns are not on the same data.'
+            f'lowest and highest in brackets; {NONE} if there are no labels, or labels that do '
+            'not vary within segments. Each method is measured on the steps of its own policies, '
+            'so columns are not on the same data.'
         ),
         Table(['task', 'composite', 'delay', *order], lines),
     ]
@@ -116,14 +116,14 @@ def unfinished(results: Sequence[Result]) -> list[Block]:
 
 
 def the_paper(r_max: Mapping[str, float]) -> list[Block]:
-    """The paper's Table 2 and what differs."""
+    """The paper's Table 2, and the differences from ours."""
     order = list(paper.TABLE_2['sum'])
     lines: list[list[str | Bold]] = [
         [composite, *(f'{by[m][0]:.4f} ({by[m][1]:.4f})' for m in order)]
         for composite, by in paper.TABLE_2.items()
     ]
     others = [task for task in r_max if task not in paper.TASKS]
-    said = ', '.join(f'{task} {value:g}' for task, value in r_max.items())
+    units = ', '.join(f'{task} {value:g}' for task, value in r_max.items())
     return [
         Heading("The paper's Table 2, and how ours differs"),
         Paragraph('Ant-v2, delays from 25 to 200, 3 trials, a million steps.'),
@@ -138,7 +138,7 @@ def the_paper(r_max: Mapping[str, float]) -> list[Block]:
             if others
             else []
         ),
-        Items([text.format(r_max=said) for text in paper.DIFFERENCES]),
+        Items([text.format(r_max=units) for text in paper.DIFFERENCES]),
     ]
 
 
@@ -162,7 +162,7 @@ def settings(results: Sequence[Result]) -> list[Block]:
 
 
 def sessions(paths: Sequence[Path]) -> list[Block]:
-    """Who ran it, where and when."""
+    """The machines, versions and times of the runs."""
     lines: list[list[str | Bold]] = []
     for path in paths:
         for session in Folder(path).index()['sessions']:

@@ -1,4 +1,4 @@
-"""What a benchmark consists of: a YAML file whose lists, multiplied, make the cells.
+"""The spec of a benchmark: a YAML file with lists whose combinations are the cells.
 
     methods: [codetr, none, 'true']
     tasks: [HalfCheetah-v5]
@@ -37,11 +37,11 @@ _AXES = {
     'seed': 'seeds',
     'steps': 'steps',
 }
-"""The settings that the spec decides by keys of its own."""
+"""The settings that have their own keys in a spec."""
 
 
 class BenchmarkError(ValueError):
-    """A benchmark that cannot be run or read: names the value, its key, the file, the remedy."""
+    """A benchmark that cannot be run or read: names value, key, file and remedy."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Cell:
     """One run of a benchmark.
 
     Attributes:
-        name: the name of its folder, the same whenever its spec names it.
+        name: the name of its folder, the same in every spec with this cell.
         settings: all of its settings.
     """
 
@@ -71,7 +71,7 @@ class _Keys(Group):
     @field_validator('methods', mode='before')
     @classmethod
     def _unquoted_true(cls, methods: Any) -> Any:
-        # YAML reads the name of the oracle as a truth value unless it is quoted
+        # YAML reads the name of the oracle as a boolean unless it is quoted
         return (
             ['true' if name is True else name for name in methods]
             if isinstance(methods, list)
@@ -92,8 +92,8 @@ class Spec:
 
     Attributes:
         keys: the spec's lists and `steps`, by key.
-        base: the settings that all cells share; what the lists decide is that of the first cell.
-        cells: all runs; those of one seed together, so that a whole table is there early.
+        base: the settings that all cells share; those of the lists are the first cell's.
+        cells: all runs, those of one seed together, so that a whole table is there early.
     """
 
     keys: Mapping[str, Any]
@@ -101,7 +101,7 @@ class Spec:
     cells: tuple[Cell, ...]
 
     def to_yaml(self) -> str:
-        """The spec with every setting spelt out: it needs no preset and no other file."""
+        """The spec with every setting, which needs no preset and no other file."""
         shared = {
             name: value
             for name, value in self.base.model_dump(mode='json').items()
@@ -115,7 +115,7 @@ def load(path: Path) -> Spec:
     """Read and validate a spec, every cell's settings included.
 
     Raises:
-        BenchmarkError: no such file, not YAML, a key or a setting that is refused, a task that
+        BenchmarkError: the file is missing or not YAML, a key or a setting is wrong, or a task
             does not exist. Names key, value and file.
     """
     try:
@@ -152,7 +152,7 @@ def load(path: Path) -> Spec:
 
 
 def _base(keys: _Keys, path: Path) -> Settings:
-    """What all cells share: the base configuration with the overrides."""
+    """The settings that all cells share: the base configuration with the overrides."""
     given = {'base': keys.config} if isinstance(keys.config, str) else dict(keys.config)
     name = given.pop('base', DEFAULT_BASE)
     source = f'spec {path}: config'
@@ -202,5 +202,5 @@ def _cells(keys: _Keys, base: Settings, path: Path) -> Iterator[Cell]:
 
 
 def cell_name(task: str, composite: str, delay: int, method: str, seed: int) -> str:
-    """The name of a cell and of its folder, as HalfCheetah-v5_sum_25_codetr_seed0."""
+    """The name of a cell and of its folder, such as HalfCheetah-v5_sum_25_codetr_seed0."""
     return f'{re.sub(r"[^A-Za-z0-9.-]+", "-", task)}_{composite}_{delay}_{method}_seed{seed}'

@@ -19,7 +19,7 @@ def spread(values: Sequence[float]) -> float | None:
 def paired_p(a: Sequence[float], b: Sequence[float]) -> float | None:
     """Two-sided p-value of a paired t-test; None for fewer than two pairs.
 
-    Where all differences are the same, they leave no doubt: 1 if they are 0, else 0.
+    If all differences are the same, it is 1 if they are 0, else 0.
     """
     if len(a) < 2:
         return None
@@ -32,7 +32,7 @@ def paired_p(a: Sequence[float], b: Sequence[float]) -> float | None:
 
 
 def interquartile_mean(values: Sequence[float]) -> float:
-    """Mean of the middle half: a quarter of the values is cut off at each end, rounded down."""
+    """Mean of the middle half: a quarter of the values, rounded down, is cut off at each end."""
     from scipy import stats
 
     return float(stats.trim_mean(np.asarray(values, np.float64), 0.25))
@@ -44,12 +44,12 @@ def interquartile_interval(
     """95 % interval of the interquartile mean of all values, by stratified bootstrap.
 
     Values are drawn with replacement within each stratum (a composite reward and delay, whose
-    values are its seeds), as Agarwal et al. (2021, "Deep RL at the edge of the statistical
-    precipice") have it; the interval is that of percentiles.
+    values are its seeds), after Agarwal et al. (2021, "Deep RL at the edge of the statistical
+    precipice"). The interval is between percentiles.
 
     Args:
         strata: values of each stratum; none is empty.
-        seed: of the draws, so that the same values give the same interval.
+        seed: of the draws: the same values give the same interval.
     """
     from scipy import stats
 

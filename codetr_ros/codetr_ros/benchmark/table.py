@@ -1,4 +1,4 @@
-"""The numbers of the table: means, spreads, what is best and what is comparable with it."""
+"""The numbers of the table: means, spreads, the best method and those comparable with it."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ TABLE_DELAYS = (25, 200)
 """A cell of Table 2 is the mean over delays from 25 to 200. The supplement says "utilizing various
 delayed steps ranging from 25 to 200"; that one number averages over them is inferred."""
 ORACLES = ('true',)
-"""Methods that see what no other may see: shown, but neither best nor compared with the best."""
+"""Methods that see rewards hidden from all others: shown, but never best, nor compared."""
 
 Pair = tuple[int, int]  # seed, delay
 
@@ -29,15 +29,15 @@ class Entry:
     Attributes:
         method: its name.
         scores, returns: of each finished cell, by seed and delay.
-        planned, failed: how many cells there should be, and how many of them failed.
+        planned, failed: number of planned cells, and of those that failed.
         mean, spread: of the scores; the spread is the sample standard deviation, over seeds, of
-            the mean over delays. None where there are no values, or for the spread fewer than two.
+            the mean over delays. None without values, or, for the spread, with fewer than two.
         return_mean, return_spread: the same of the true returns.
         iqm, interval: interquartile mean of the scores and its 95 % bootstrap interval.
         best: whether its mean is the highest, oracles left out.
         p: of a paired t-test against the best over the pairs (seed, delay) that both have; None
-            where it is the best or an oracle, or there are fewer than two pairs.
-        pairs: how many pairs that were.
+            if it is the best or an oracle, or with fewer than two pairs.
+        pairs: number of these pairs.
     """
 
     method: str
@@ -164,10 +164,10 @@ class Aggregate:
     """The interquartile mean of a method's scores on a task, with its interval.
 
     Attributes:
-        task, method: of which.
-        composites: over which, with the delays of `rows`.
+        task, method: of the scores.
+        composites: of the scores, with the delays of `rows`.
         iqm, interval: interquartile mean and 95 % interval.
-        cells: how many scores.
+        cells: number of scores.
     """
 
     task: str
@@ -180,7 +180,7 @@ class Aggregate:
 
 def aggregate(together: Sequence[Row]) -> list[Aggregate]:
     """Each method over all composite rewards of a task; strata are composite reward and delay."""
-    found = []
+    aggregates = []
     for task in dict.fromkeys(row.task for row in together):
         strata: dict[str, dict[tuple[str, int], list[float]]] = defaultdict(
             lambda: defaultdict(list)
@@ -191,7 +191,7 @@ def aggregate(together: Sequence[Row]) -> list[Aggregate]:
                     strata[entry.method][row.composite, delay].append(score)
         for method, of in strata.items():
             values = [score for scores in of.values() for score in scores]
-            found.append(
+            aggregates.append(
                 Aggregate(
                     task=task,
                     method=method,
@@ -201,4 +201,4 @@ def aggregate(together: Sequence[Row]) -> list[Aggregate]:
                     cells=len(values),
                 )
             )
-    return found
+    return aggregates
