@@ -6,11 +6,11 @@ The rules of time, where `now` is the time at which a message was received (its 
 * A step begins with each command, or at a fixed rate from an episode's first command on. Its
   observation and action are those that hold at its begin; its next observation is the one that
   holds at the begin of the next step.
-* An episode ends at a message of the episode topic, where no command comes for `gap` seconds, and
-  where a step has no observation that is young and finite: no step crosses a hole.
-* The next observation of an episode's last step is the one that holds at the episode's end. If the
-  step before took less time than is left until then, it is the one that holds after that time.
-  If nothing was observed in between, the step is dropped.
+* An episode ends at a message that matches the episode rule, where no command comes for `gap`
+  seconds, and where a step has no observation that is young and finite: no step crosses a hole.
+* The next observation of an episode's last step is the one that holds at the episode's end, or,
+  if that is earlier, as long after the step's begin as the step before took. If nothing was
+  observed in between, the step is dropped.
 * `episode_scores` decides which steps a score is of.
 
 Everything that is dropped is counted.
