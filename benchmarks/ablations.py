@@ -1,25 +1,26 @@
-"""What do CoDeTr's switches do to what is learnt? By return and by reward recovery.
+"""How do CoDeTr's switches change return and reward recovery?
 
     .venv/bin/python benchmarks/ablations.py run readings --workers 2       # twenty minutes
     .venv/bin/python benchmarks/ablations.py table readings
     .venv/bin/python benchmarks/ablations.py run savings --workers 2        # 45 minutes
     .venv/bin/python benchmarks/ablations.py table savings
 
-Two studies, each on one task, with every variant under the same seeds, as cells of `codetr
-benchmark run` (resumable like any benchmark). `table` writes the final returns and how well step
-rewards were recovered at the last evaluation to `benchmarks/results/`:
+There are two studies, each on one task. All variants have the same seeds and are cells of `codetr
+benchmark run` (resumable like any benchmark). `table` writes the final returns and the recovery of
+step rewards at the last evaluation to `benchmarks/results/`:
 
-`readings` (`ablations.csv`, `.md`): which reading of the paper learns better? It leaves open which
-scalar becomes the step reward, how attention within the sequence is scaled, in which unit
-composite rewards are fitted, how far back the causal transformer sees, and whether segments or
-windows are labelled. On Reacher-v5 with a score every 10 of its 50 steps, which is their sum or
-their soft maximum: 8000 steps of it take half a minute, and every step of it has a reward of its
+`readings` (`ablations.csv`, `.md`): which reading of the paper learns better? The paper leaves
+open which scalar becomes the step reward, how attention within the sequence is scaled, in which
+unit composite rewards are fitted, how far back the causal transformer sees, and whether segments
+or windows are labelled. The task is Reacher-v5 with a score every 10 of its 50 steps, which is
+their sum or their soft maximum. Its 8000 steps take half a minute, and each has a reward of its
 own, so that credit matters and survival means nothing.
 
-`savings` (`savings.csv`, `.md`): what do the switches that save time cost? Labelling again only a
-part of the memory in each phase (`relabel_steps`), and products in bfloat16. On HalfCheetah-v5
-with sums of 25 steps, 30 000 of them. For each variant the steps labelled, and the age of labels
-at the end: gradient steps taken since a step was labelled, mean over the memory and the oldest.
+`savings` (`savings.csv`, `.md`): what do the switches that save time cost? They label only a part
+of the memory again in each phase (`relabel_steps`), or compute products in bfloat16. The task is
+HalfCheetah-v5 with sums of 25 steps, for 30 000 steps. The table has for each variant the steps
+labelled, and the age of labels at the end: the gradient steps taken since a step was labelled, as
+mean over the memory and for the oldest label.
 """
 
 import argparse
@@ -37,7 +38,7 @@ import yaml
 RESULTS = Path(__file__).parent / 'results'
 COLUMNS = ('composite', 'variant', 'seed', 'final_return', 'pearson', 'within')
 SAVED = ('steps_labelled', 'label_age_mean', 'label_age_max')
-"""Of these `steps_labelled` is summed over phases, the others are those of the last."""
+"""`steps_labelled` is summed over phases; the others are those of the last phase."""
 
 
 @dataclass(frozen=True)
@@ -45,16 +46,16 @@ class Study:
     """Variants of one method's settings on one task.
 
     Args:
-        file: the results' name.
+        file: name of the results.
         task: the task.
         delay: steps from score to score.
         steps: of each run.
         seeds: of each variant.
         composites: composite rewards.
-        config: what all variants have in common.
-        variants: what each one changes, by name.
-        references: methods beside which the variants are put.
-        saved: whether what labelling took is told.
+        config: the settings of all variants.
+        variants: the changes of each variant, by name.
+        references: methods to compare the variants with.
+        saved: whether the table has the costs of labelling.
     """
 
     file: str
@@ -75,13 +76,13 @@ class Study:
 
     def benchmarks(self) -> dict[str, dict[str, Any]]:
         """Every benchmark's specification by the name of its folder."""
-        found = {
+        specifications = {
             _slug(name): self._specification(['codetr'], changes)
             for name, changes in self.variants.items()
         }
         if self.references:
-            found['references'] = self._specification(list(self.references), {})
-        return found
+            specifications['references'] = self._specification(list(self.references), {})
+        return specifications
 
     def _specification(self, methods: list[str], changes: dict[str, Any]) -> dict[str, Any]:
         return {
@@ -147,7 +148,7 @@ def _slug(name: str) -> str:
 
 
 def run(study: Study, out: Path, workers: int) -> int:
-    """Run what has not been run."""
+    """Run what has not been run yet; returns the exit code."""
     out.mkdir(parents=True, exist_ok=True)
     code = 0
     for name, data in study.benchmarks().items():
@@ -160,9 +161,9 @@ def run(study: Study, out: Path, workers: int) -> int:
 
 
 def rows(study: Study, out: Path) -> list[dict[str, Any]]:
-    """What the finished runs have shown."""
+    """The results of the finished runs."""
     names = {_slug(name): name for name in study.variants} | {'references': ''}
-    found = []
+    results = []
     for slug, name in names.items():
         for path in sorted((out / slug).glob('*/summary.json')):
             summary = json.loads(path.read_text())
@@ -178,28 +179,28 @@ def rows(study: Study, out: Path) -> list[dict[str, Any]]:
                 'wall_s': summary['wall_s'],
                 'commit': ending.get('commit'),
             }
-            found.append(row | (labelling(path.with_name('metrics.csv')) if study.saved else {}))
-    return sorted(found, key=lambda row: study.composites.index(row['composite']))
+            results.append(row | (labelling(path.with_name('metrics.csv')) if study.saved else {}))
+    return sorted(results, key=lambda row: study.composites.index(row['composite']))
 
 
 def labelling(metrics: Path) -> dict[str, float]:
-    """What labelling took in a run, by the reward side's metrics."""
+    """The costs of labelling in a run, by the metrics of the reward node."""
     with metrics.open() as file:
-        said = list(csv.DictReader(file))
-    found: dict[str, float] = {}
+        phases = list(csv.DictReader(file))
+    costs: dict[str, float] = {}
     for name in SAVED:
-        values = [float(cell) for row in said if (cell := row.get(f'reward.{name}'))]
-        found[name] = sum(values) if name == 'steps_labelled' else values[-1]
-    return found
+        values = [float(cell) for row in phases if (cell := row.get(f'reward.{name}'))]
+        costs[name] = sum(values) if name == 'steps_labelled' else values[-1]
+    return costs
 
 
 def table(study: Study, out: Path) -> None:
     """Write every run as CSV and the means over seeds as Markdown."""
-    found = rows(study, out)
+    results = rows(study, out)
     with (RESULTS / f'{study.file}.csv').open('w', newline='') as file:
         writer = csv.DictWriter(file, study.columns)
         writer.writeheader()
-        writer.writerows(found)
+        writer.writerows(results)
     means = ('pearson', 'within', *(SAVED if study.saved else ()))
     lines = [
         f'{study.task}, delay {study.delay}, {study.steps} steps, preset quick: return of the '
@@ -210,8 +211,10 @@ def table(study: Study, out: Path) -> None:
         f'{" | ".join(means).replace("_", " ")} |',
         f'|---|---|---:|---:|---:|---|{"---:|" * len(means)}',
     ]
-    for composite, variant in dict.fromkeys((row['composite'], row['variant']) for row in found):
-        mine = [row for row in found if (row['composite'], row['variant']) == (composite, variant)]
+    for composite, variant in dict.fromkeys((row['composite'], row['variant']) for row in results):
+        mine = [
+            row for row in results if (row['composite'], row['variant']) == (composite, variant)
+        ]
         returns = [row['final_return'] for row in mine]
         cells = [composite, variant, str(len(mine)), f'{statistics.mean(returns):.2f}']
         cells.append(f'{statistics.stdev(returns):.2f}' if len(mine) > 1 else '')

@@ -1,6 +1,4 @@
-"""How fast `codetr bag play` is, with a live reward node whose method learns nothing: a part of
-`bags.py`.
-"""
+"""Measure `codetr bag play` with a live reward node whose method learns nothing, for `bags.py`."""
 
 import importlib.util
 import os
@@ -14,11 +12,11 @@ from codetr_ros.config import Settings
 from codetr_ros.processes import launcher
 
 BEGUN, LEARNT = 'phase 0 is played', 'everything is played and learnt from'
-"""What the player says at the first commit, and when its last phase has been handled."""
+"""The player prints these at the first commit, and when its last phase has been handled."""
 
 
 def available() -> bool:
-    """Whether there is ROS to play with."""
+    """Whether ROS is there."""
     return importlib.util.find_spec('rclpy') is not None
 
 
@@ -32,7 +30,7 @@ def play(bag: Path, settings: Settings, logs: Path) -> tuple[float, float]:
 
     Returns:
         Seconds, and CPU seconds of both processes, from the first commit played to the last phase
-        handled; starting is not among them.
+        handled, without the start.
     """
     namespace = f'/bench_{os.getpid()}'
     environment = launcher.environment(settings)
@@ -52,11 +50,11 @@ def play(bag: Path, settings: Settings, logs: Path) -> tuple[float, float]:
             env=environment,
         ) as player:
             both = player.pid, processes.nodes[0].process.pid
-            spent, said = _watch(player, both)
+            spent, output = _watch(player, both)
             code = player.wait()
-        heard = (logs / 'reward.log').read_text()
-        if code or len(spent) != 2 or 'refused' in heard or 'incomplete' in heard:
-            raise SystemExit(f'not everything was played and taken in:\n{"".join(said)}{heard}')
+        log = (logs / 'reward.log').read_text()
+        if code or len(spent) != 2 or 'refused' in log or 'incomplete' in log:
+            raise SystemExit(f'not everything was played and received:\n{"".join(output)}{log}')
         processes.nodes[0].process.wait(launcher.STOP_DEADLINE)
     (began, cpu), (ended, cpu_then) = spent
     return ended - began, cpu_then - cpu
@@ -65,11 +63,11 @@ def play(bag: Path, settings: Settings, logs: Path) -> tuple[float, float]:
 def _watch(
     player: 'subprocess.Popen[str]', both: tuple[int, int]
 ) -> tuple[list[tuple[float, float]], list[str]]:
-    """The clock and the CPU seconds when the player says one or the other; all that it said."""
-    spent, said = [], []
+    """The clock and the CPU seconds when the player prints BEGUN or LEARNT, and its output."""
+    spent, output = [], []
     assert player.stdout
     for line in player.stdout:
-        said.append(line)
+        output.append(line)
         if BEGUN in line or LEARNT in line:
             spent.append((time.perf_counter(), sum(map(machine.cpu_seconds, both))))
-    return spent, said
+    return spent, output

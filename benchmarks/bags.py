@@ -1,15 +1,14 @@
-"""How fast are bags recorded, verified, recovered, read and played, against rosbags in the same
-call?
+"""How fast are bags recorded, verified, recovered, read and played, compared with rosbags?
 
     .venv/bin/python benchmarks/bags.py
 
 Steps have Ant's sizes: 8 actions and 27 observations (Ant-v4) or 105 (Ant-v5). A million of each,
 random numbers, in the shape of a run: chunks of 500 steps, a phase and its commit every 1000, an
 episode every 1000, a score and a true reward for every 25 steps, labels for each phase. The
-messages are encoded before the clock starts; what is timed:
+messages are encoded before the clock starts. Timed are:
 
   record            our writer, with an fsync before and after each commit's message (two syncs for
-                    each 1000 steps), as the recorder does it
+                    each 1000 steps), as in the recorder
   write, rosbags    the same bytes with rosbags' writers, MCAP and SQLite: no sync, no CRC
   read raw          every message as bytes; ours checks every CRC, rosbags writes none
   read decoded      every message decoded; ours into records that own their memory, rosbags' into
@@ -17,16 +16,16 @@ messages are encoded before the clock starts; what is timed:
   into memory       Transitions and scores into `Trajectories`, ready to be sampled
   verify            everything that `codetr bag verify` compares
   recover           a bag whose index and last bytes are gone to a whole one, verified
-  info              what `codetr bag info` counts
+  info              the counts of `codetr bag info`
   play              `codetr bag play` to a live reward node, from the first commit played to the
                     last phase handled. Its method is `uniform`, which learns nothing, and it has
-                    no folder for checkpoints, each of which waits for the disk: what takes time
-                    is to read, publish, take in and label. Skipped where there is no ROS
+                    no folder for checkpoints, each of which waits for the disk: the time is that
+                    of reading, publishing, receiving and labelling. Skipped without ROS
 
-MB are those of the messages' bytes. Each is done once, one after the other, in one process, the
-files in the page cache as the writers left them; playing takes two more. Rates are by the clock;
-`cpu_s` is what the process itself worked (playing: player and reward node), which other work on
-the machine changes less.
+MB are those of the messages' bytes. Each is done once, one after the other, in one process, with
+the files in the page cache as the writers left them; playing takes two more processes. Rates are
+by the clock; `cpu_s` is the CPU time of the process itself (playing: player and reward node),
+which other work on the machine changes less.
 """
 
 import argparse
@@ -74,13 +73,13 @@ COLUMNS = ('what', 'by', 'observations', 'steps', 'seconds', 'cpu_s', 'steps_per
 
 
 def settings_of(steps: int) -> Settings:
-    """Of the run. Its reward node learns nothing, so that playing is not hidden by learning."""
+    """The settings of the run, whose reward node learns nothing, so as not to hide playing."""
     about = {'steps': steps, 'delay': DELAY, 'task': 'Ant-v5', 'method': 'uniform'}
     return load('cpu').changed(about)
 
 
 def a_run(steps: int, observations: int) -> Iterator[list[Record]]:
-    """What is recorded up to each commit, one phase after the other."""
+    """Yield the records up to each commit, one phase after the other."""
     rng = np.random.default_rng(0)
     settings = settings_of(steps)
     task = TaskSpec(
@@ -237,7 +236,7 @@ def write_with_rosbags(
 
 
 def read_with_rosbags(folder: Path, decoded: bool) -> int:
-    """How many messages rosbags finds."""
+    """The number of messages that rosbags reads."""
     count = 0
     with AnyReader([folder], default_typestore=own_types()) as reader:
         for connection, _, raw in reader.messages():
@@ -248,7 +247,7 @@ def read_with_rosbags(folder: Path, decoded: bool) -> int:
 
 
 def into_memory(folder: Path, steps: int, observations: int) -> int:
-    """How many steps end up in the memory."""
+    """The number of steps that end up in the memory."""
     memory = Trajectories(observations, ACTIONS, DELAY, steps, 2 * PHASE)
     for entry in Bag(folder).entries([Transitions, CompositeReward]):
         if isinstance(entry.record, Transitions):
@@ -270,12 +269,12 @@ def cut_short(folder: Path, new: Path) -> Path:
 
 
 def measure(steps: int, observations: int, folder: Path) -> Iterator[dict[str, Any]]:
-    """Do everything once; one row for each."""
+    """Do everything once; yields a row for each measurement."""
     size = 0
 
     def row(what: str, by: str, watch: Stopwatch) -> dict[str, Any]:
         seconds = watch.seconds
-        found = dict(
+        cells = dict(
             zip(
                 COLUMNS,
                 (
@@ -286,8 +285,8 @@ def measure(steps: int, observations: int, folder: Path) -> Iterator[dict[str, A
                 strict=True,
             )
         )  # fmt: skip
-        print(found, flush=True)
-        return found
+        print(cells, flush=True)
+        return cells
 
     def timed(what: str, by: str, call: Callable[[], object]) -> dict[str, Any]:
         watch = Stopwatch()
@@ -324,7 +323,7 @@ def measure(steps: int, observations: int, folder: Path) -> Iterator[dict[str, A
         watch.seconds, watch.cpu = bag_playing.play(ours, settings_of(steps), folder)
         yield row('play', 'ours, to a reward node', watch)
     else:
-        print('play: skipped, rclpy is not here')
+        print('play: skipped, rclpy cannot be imported')
 
 
 def consume(folder: Path) -> int:
@@ -332,8 +331,8 @@ def consume(folder: Path) -> int:
 
 
 def check_memory(folder: Path, steps: int, observations: int) -> None:
-    found = into_memory(folder, steps, observations)
-    assert found == steps, found
+    stored = into_memory(folder, steps, observations)
+    assert stored == steps, stored
 
 
 def check_sound(folder: Path) -> None:
@@ -342,7 +341,7 @@ def check_sound(folder: Path) -> None:
 
 
 def circumstances(load_at_start: str) -> str:
-    """Of what, and where, this is measured."""
+    """The program, machine and versions of the measurement."""
     facts = machine.facts(load_at_start, ('rosbags', 'mcap', 'numpy'))
     return f'`benchmarks/bags.py`, each once: {"; ".join(map(" ".join, facts.items()))}.'
 

@@ -4,27 +4,26 @@
     .venv/bin/python benchmarks/codetr_speed.py --delays 25 100 --threads 1 --rounds 3
     .venv/bin/python benchmarks/codetr_speed.py --device cuda --threads 1 --out codetr_speed_cuda
 
-Measured, at the size that the preset `paper` gives the reward transformer, on steps of Ant (27
-observations, 8 actions), for each delay n:
-  - gradient: one gradient step as the reward node takes it, batch drawn from the memory
-  - label: whole segments of the memory labelled as the reward node labels them
+The reward transformer has the size of the preset `paper`, the steps those of Ant (27 observations,
+8 actions). Measured are, for each delay n:
+  - gradient: one gradient step of the reward node, with its batch drawn from the memory
+  - label: the reward node's labelling of whole segments of the memory
 
-Each is set against its floor: the floating point operations that it needs
+Each is compared with its floor: the floating point operations that it needs
 (`codetr_ros.rewards.cost`), at the rate that products of matrices of the same precision reach in
 the same round. That rate is the higher one of two shapes: 256x256 by 256x256, and the tokens of 64
 segments of 25 steps by the MLP's weights. A ratio of 1 is as fast as the products alone. `as
-written` is the same ratio with the operations of a network that is written plainly, with the
-tokens that nobody reads and the products that are then masked, which are left out here. Rounds go
-through everything in turn; the table gives the median round, and the lowest and highest in
-brackets.
+written` is the same ratio with the operations of a plainly written network, which has tokens that
+are never read and products that are then masked; our network leaves out both. Rounds go through
+everything in turn; the table gives the median round, and the lowest and highest in brackets.
 
-On a GPU (`--device cuda`) 4096x4096 by 4096x4096 takes the place of the first shape, as so small
-ones reach little there, and a memory of a million steps is labelled whole, 4096 segments at a
-time, or as many as each of `--label-batches` says, in parts whose activations take a gigabyte, or
-as much as each of `--part-mib` says. The batches that it learns from are made on the CPU.
+On a GPU (`--device cuda`) 4096x4096 by 4096x4096 replaces the first shape, because such small ones
+reach little there. A memory of a million steps is labelled whole, 4096 segments at a time, or as
+many as each of `--label-batches`, in parts whose activations take a gigabyte, or as much as each
+of `--part-mib`. The batches that it learns from are made on the CPU.
 
-`--clock cpu` counts the time that the processor worked instead of the time on the wall: for one
-thread on a machine that does other things as well.
+`--clock cpu` counts the processor's working time instead of wall time: for one thread on a machine
+that does other things as well.
 """
 
 import argparse
@@ -61,12 +60,12 @@ LARGE = 4096, 4096, 4096  # for a GPU
 
 def memory(delay: int, episodes: int) -> Trajectories:
     """Scored episodes of random steps."""
-    found = Trajectories(OBSERVATION, ACTION, delay, EPISODE * episodes, EPISODE)
+    scored = Trajectories(OBSERVATION, ACTION, delay, EPISODE * episodes, EPISODE)
     rng = np.random.default_rng(0)
     for n in range(episodes):
         observations = rng.standard_normal((EPISODE + 1, OBSERVATION), np.float32)
         actions = rng.uniform(-1, 1, (EPISODE, ACTION)).astype(np.float32)
-        found.append(
+        scored.append(
             Transitions(
                 run_id='run',
                 source='sim',
@@ -85,7 +84,7 @@ def memory(delay: int, episodes: int) -> Trajectories:
         )
         for first in range(0, EPISODE, delay):
             value = float(rng.standard_normal())
-            found.score(
+            scored.score(
                 CompositeReward(
                     run_id='run',
                     source='sim',
@@ -97,11 +96,11 @@ def memory(delay: int, episodes: int) -> Trajectories:
                     value=value,
                 )
             )
-    return found
+    return scored
 
 
 class Work:
-    """What is measured for one delay."""
+    """The work that is measured for one delay."""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
@@ -115,7 +114,7 @@ class Work:
         self.steps = 0
 
     def gradient(self) -> tuple[int, int]:
-        """One gradient step; the operations that it needs, and those of the plain form."""
+        """Take a gradient step; returns its operations, and those of the plain form."""
         seed_torch(0, 'reward', self.steps)
         self.model.gradient_step(self.memory, generator(0, 'reward', self.steps))
         self.steps += 1
@@ -123,7 +122,7 @@ class Work:
         return needed.gradient, plain.gradient
 
     def label(self) -> tuple[int, int]:
-        """Label some segments; the operations that it needs, and those of the plain form."""
+        """Label some segments; returns their operations, and those of the plain form."""
         for i in range(0, len(self.ids), self.model.label_batch):
             some = self.ids[i : i + self.model.label_batch]
             for _ in self.model.label_passes(self.memory, some):
@@ -138,7 +137,7 @@ class Work:
 
 
 def products(device: torch.device, precision: str) -> float:
-    """Operations per second of products of matrices of a precision."""
+    """Operations per second of matrix products in a precision."""
     best = 0.0
     options: dict[str, Any] = {'device': device, 'dtype': getattr(torch, precision)}
     on_gpu = device.type != 'cpu'
@@ -159,7 +158,7 @@ def products(device: torch.device, precision: str) -> float:
 
 
 def wait(device: torch.device) -> None:
-    """Until the device has done what it was asked for."""
+    """Wait until the device has finished its work."""
     if device.type != 'cpu':
         torch.accelerator.synchronize(device)
 
@@ -169,7 +168,7 @@ clock = 'wall'
 
 
 def measure(options: tuple[Any, ...], rounds: int, device: str) -> list[dict[str, Any]]:
-    """All rounds with some options, in the order of `OPTIONS`."""
+    """Do all rounds with some options, given in the order of `OPTIONS`."""
     delay, threads, precision, label_batch, part_mib = options
     torch.set_num_threads(threads)
     sequence.DEVICE_PART_BYTES = part_mib << 20
@@ -182,7 +181,7 @@ def measure(options: tuple[Any, ...], rounds: int, device: str) -> list[dict[str
         'label': (work.label, len(work.ids) * delay),
     }
     for task, _ in tasks.values():
-        task()  # does not count
+        task()  # not counted
         wait(where)
     rows = []
     for n in range(rounds):
@@ -228,7 +227,7 @@ def line(rows: list[dict[str, Any]]) -> str:
 
 
 def write(rows: list[dict[str, Any]], out: Path, facts: dict[str, str]) -> None:
-    """The CSV file of all rounds, and the table."""
+    """Write the CSV file of all rounds, and the table."""
     with out.with_suffix('.csv').open('w', newline='') as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
@@ -253,7 +252,7 @@ def main() -> None:
     parser.add_argument('--threads', type=int, nargs='+', default=[1, 2])
     parser.add_argument('--precisions', nargs='+', default=['float32', 'bfloat16'])
     parser.add_argument('--label-batches', type=int, nargs='+', help='256 on a CPU, else 4096')
-    parser.add_argument('--part-mib', type=int, nargs='+', default=[1024], help='of a GPU only')
+    parser.add_argument('--part-mib', type=int, nargs='+', default=[1024], help='on a GPU only')
     parser.add_argument('--rounds', type=int, default=7)
     parser.add_argument('--clock', choices=list(CLOCKS), default='wall')
     parser.add_argument('--device', default='cpu', help='cpu, cuda, cuda:1, ...')
@@ -272,7 +271,8 @@ def main() -> None:
     for threads, delay, *others in itertools.product(*lists, arguments.part_mib):
         options = (delay, threads, *others)
         rows += measure(options, arguments.rounds, arguments.device)
-        write(rows, RESULTS / arguments.out, facts)  # what is cut off later is not lost
+        # after each, so that a later interruption loses nothing
+        write(rows, RESULTS / arguments.out, facts)
 
 
 if __name__ == '__main__':

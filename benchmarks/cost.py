@@ -1,9 +1,9 @@
 """What the reward transformer costs: the floating point operations of its matrix products.
 
-Two operations for each multiplication, as everybody counts them. Counted is what the algorithm
-needs and nothing else: attention to the tokens that a token may see, and in the last layer the
-tokens only that are read. The rest (softmax, norms, dropout) is linear in the activations and left
-out: at the rate of matrix products this is the least time that a pass can take, its floor.
+A multiplication counts as two operations, as usual. The count has only the needs of the
+algorithm: attention to the tokens that a token may see, and in the last layer only the tokens that
+are read. The rest (softmax, norms, dropout) is linear in the activations and left out. At the rate
+of matrix products this gives the least time that a pass can take, its floor.
 """
 
 from dataclasses import dataclass
@@ -21,8 +21,8 @@ class Cost:
         action_size: A.
         windows: B.
         steps: L, of each window.
-        plain: count what a network takes that is written plainly: all tokens through all layers,
-            and products with tokens that are then masked.
+        plain: count a plainly written network: all tokens go through all layers, and products
+            with tokens are masked afterwards.
     """
 
     settings: CodetrSettings
@@ -34,32 +34,32 @@ class Cost:
 
     @property
     def forward(self) -> int:
-        """Of labelling the windows."""
+        """Operations of labelling the windows."""
         return self._inputs + self._products
 
     @property
     def gradient(self) -> int:
-        """Of a gradient step: a product forward is two backward, but nobody asks for the gradients
-        of observations and actions.
+        """Operations of a gradient step: each product forward gives two backward, except that the
+        gradients of observations and actions are not needed.
         """
         return 2 * self._inputs + 3 * self._products
 
     @property
     def unseen(self) -> int:
-        """By how much a forward pass that masks tokens in place of leaving them out takes more."""
+        """Extra operations of a forward pass that masks tokens instead of leaving them out."""
         tokens, last = self._tokens
         every = (self.settings.layers - 1) * tokens**2 + last * tokens
         return 4 * self.windows * self.settings.embedding * (every - self._seen)
 
     @property
     def _tokens(self) -> tuple[int, int]:
-        """Tokens of a window, and how many of them the last layer makes: one for each step."""
+        """Tokens of a window, and tokens that the last layer makes: one for each step."""
         tokens = self.steps * (2 if self.settings.tokens == 'pair' else 1)
         return tokens, tokens if self.plain else self.steps
 
     @property
     def _seen(self) -> int:
-        """Pairs of a token and one that it sees, in all layers of one window."""
+        """Pairs of a token and a token that it sees, in all layers of one window."""
         tokens, _ = self._tokens
         if self.plain:
             return self.settings.layers * tokens**2

@@ -1,16 +1,16 @@
-"""Where within segments does CoDeTr put credit: its weights w, its rewards rhat, their product.
+"""Where within segments does CoDeTr put credit: its weights w, rewards rhat and their product?
 
     .venv/bin/python benchmarks/credit.py runs/halfcheetah/*_codetr_*
 
-Takes the reward models that finished runs of HalfCheetah have left (score every 25 steps, method
-codetr) and lets each label the same held-out episodes, those of `reward_recovery.py`, which none
-of them was trained on. For each model:
+Takes the reward models of finished runs of HalfCheetah (score every 25 steps, method codetr). Each
+labels the same held-out episodes, those of `reward_recovery.py`, which none of them was trained
+on. For each model:
 
     composite_r2          R^2 of the predicted composite reward
     weights_sd            standard deviation of w (1 on average)
-    top_share             share of a segment's credit |w rhat| on the step that has most of it;
-                          spread evenly it would be 1/25 = 0.04
-    stored                what the run took for the step reward, `codetr.label`: w rhat or rhat
+    top_share             share of a segment's credit |w rhat| on the step with most of it;
+                          an even spread gives 1/25 = 0.04
+    stored                the step reward of the run, `codetr.label`: w rhat or rhat
     label, rhat           Pearson correlation of w rhat, and of rhat alone, with the true reward
     within_label, ...     the same with each segment's mean removed from both
 
@@ -67,7 +67,7 @@ def measure(run: Path, data: dict[str, np.ndarray]) -> dict[str, object]:
 
 
 def centred(values: np.ndarray) -> np.ndarray:
-    """Without each segment's mean."""
+    """The values less each segment's mean."""
     return values - values.mean(1, keepdims=True)
 
 

@@ -2,21 +2,21 @@
 
     .venv/bin/python benchmarks/default_task.py
 
-makes the runs that are still missing, then the table and the picture. `run`, `table` or `plot` as
-an argument do only that. A run is the command that users have, `codetr train`, in process unless
-`--over-topics` is given. It leaves one JSON file in `<out>/runs/`, and what is there is not run
-again.
+makes the runs that are still missing, then the table and the picture. With the argument `run`,
+`table` or `plot` it does only that. A run is the users' own command, `codetr train`, in process
+unless `--over-topics` is given. It leaves one JSON file in `<out>/runs/`; runs with a file there
+are not made again.
 
-The methods: `codetr`; `none` (the composite reward goes to its segment's last step, which is what
-an agent without redistribution sees); `uniform` (each step of a segment gets an equal share);
-`true` (the environment's own rewards, which no other method sees) and `ones` (a constant 1); and
-the uniformly random policy, which each run evaluates once. On the default task, where staying
-upright is everything, `ones` says how little credit assignment is asked for.
+The methods: `codetr`; `none` (the composite reward goes to its segment's last step, as an agent
+without redistribution sees it); `uniform` (each step of a segment gets an equal share); `true`
+(the environment's own rewards, which no other method sees) and `ones` (a constant 1); and the
+uniformly random policy, which each run evaluates once. On the default task, where staying upright
+is everything, `ones` shows how little credit assignment it needs.
 
 The table gives for each method, over seeds: mean, sample standard deviation, lowest and highest
 of the last evaluation's true return and score (1 is an agent that earns the task's largest reward
 at every step), and the step of the first evaluation whose true return is at least 90 % of
-`--best`, for each seed; it is no finer than evaluations are far apart.
+`--best`, for each seed, with the distance between evaluations as its resolution.
 
 Another task, composite reward or length goes into another folder:
 
@@ -50,7 +50,7 @@ METHODS = {
     'none': 'none: composite reward only',
 }
 RANDOM = 'random'
-STYLES = {  # colour (Okabe and Ito: told apart by all), marker, line
+STYLES = {  # colour (Okabe and Ito: safe for the colour-blind), marker, line
     'codetr': ('#D55E00', 'o', '-'),
     'true': ('#000000', 's', '-.'),
     'uniform': ('#0072B2', '^', '-'),
@@ -64,13 +64,11 @@ MEASURES = {'true return': 'final_true_return', 'score': 'final_score'}
 
 
 class ResultsError(ValueError):
-    """Results that do not belong together or are not there: names the files and says what to
-    do.
-    """
+    """Results that do not belong together or are not there: names the files and the remedy."""
 
 
 def changes_of(arguments: argparse.Namespace) -> dict[str, Any]:
-    """The settings that were given on the command line, by name."""
+    """The settings given on the command line, by name."""
     names = ('task', 'delay', 'composite', 'steps')
     return {n: value for n in names if (value := getattr(arguments, n)) is not None}
 
@@ -78,41 +76,41 @@ def changes_of(arguments: argparse.Namespace) -> dict[str, Any]:
 def run_one(
     settings: Settings, flags: Sequence[str], path: Path, in_process: bool, measured: str
 ) -> float:
-    """One run by the command that users have: its results go to `path`.
+    """Make one run by the users' own command, and write its results to `path`.
 
     Args:
-        settings: what the command will make of `flags`; checked against what it did.
-        flags: the command's flags, but for those that say where and how it runs.
-        path: the JSON file to be made.
-        in_process: without nodes.
+        settings: the settings expected from `flags`, to check the run's own.
+        flags: the command's flags, except those for the output folder and the process.
+        path: the JSON file to make.
+        in_process: run without nodes.
         measured: the commit.
 
     Returns:
         The final true return.
 
     Raises:
-        RuntimeError: the run failed; holds the end of what it said.
+        RuntimeError: the run failed; holds the end of its output.
     """
-    said = ['train', *(['--in-process'] if in_process else []), *flags]
+    words = ['train', *(['--in-process'] if in_process else []), *flags]
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder, 'run')
-        command = [sys.executable, '-m', 'codetr_ros.cli', *said, '--out', str(out)]
+        command = [sys.executable, '-m', 'codetr_ros.cli', *words, '--out', str(out)]
         done = subprocess.run(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
         )
         if done.returncode:
             end = '\n'.join(done.stdout.splitlines()[-30:])
             raise RuntimeError(
-                f'codetr {" ".join(said)} ended with exit code {done.returncode}:\n{end}'
+                f'codetr {" ".join(words)} ended with exit code {done.returncode}:\n{end}'
             )
         summary = json.loads((out / 'summary.json').read_text())
     if summary['settings_hash'] != settings.hash():
-        raise RuntimeError(f'codetr {" ".join(said)} ran with other settings than were asked for')
+        raise RuntimeError(f'codetr {" ".join(words)} ran with other settings than the given ones')
     keys = ('method', 'seed', 'in_process', 'evaluations', 'random', 'final_true_return')
     keys += ('final_score', 'wall_s', 'steps', 'lost', 'refused', 'updates', 'gradient_steps')
     keys += ('policy_sha256', 'versions', 'settings_hash', 'settings')
     result = {
-        'command': f'codetr {" ".join(said)}',
+        'command': f'codetr {" ".join(words)}',
         'commit': measured,
         **{key: summary[key] for key in keys},
     }
@@ -123,7 +121,7 @@ def run_one(
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Make the runs that are still missing; how many failed."""
+    """Make the runs that are still missing; returns how many failed."""
     changes, in_process = changes_of(arguments), not arguments.over_topics
     folder = arguments.out / 'runs'
     folder.mkdir(parents=True, exist_ok=True)
@@ -158,7 +156,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(f'{path.stem}: {final:.1f} in {time.monotonic() - began:.0f} s', flush=True)
         return True
 
-    print(f'{len(jobs)} runs to be made, {arguments.workers} at a time', flush=True)
+    print(f'{len(jobs)} runs to make, {arguments.workers} at a time', flush=True)
     with ThreadPoolExecutor(arguments.workers) as pool:
         futures = [pool.submit(job, *each) for each in jobs]
         try:
@@ -185,7 +183,7 @@ def read_runs(out: Path) -> list[dict[str, Any]]:
             if key not in ('method', 'seed') and value != other:
                 raise ResultsError(
                     f'{path} has {key} = {value}, {paths[0]} has {other}: results of different '
-                    'settings belong into different folders (--out)'
+                    'settings belong in different folders (--out)'
                 )
         if one['in_process'] != runs[0]['in_process']:
             raise ResultsError(
@@ -198,14 +196,14 @@ def read_runs(out: Path) -> list[dict[str, Any]]:
 
 def by_method(runs: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
     """Runs by method, in the order of METHODS."""
-    found: dict[str, list[dict[str, Any]]] = {}
+    runs_of: dict[str, list[dict[str, Any]]] = {}
     for one in runs:
-        found.setdefault(one['method'], []).append(one)
-    return found
+        runs_of.setdefault(one['method'], []).append(one)
+    return runs_of
 
 
 def random_of(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The random policy, once for each seed: it is the same whatever method it is run beside."""
+    """The random policy, once for each seed: it is the same beside every method."""
     by_seed = {one['seed']: one['random'] for one in runs if one['random']}
     return [
         {
@@ -237,7 +235,7 @@ def spread(values: Sequence[float]) -> dict[str, float | None]:
 
 
 def best_of(arguments: argparse.Namespace, task: str) -> float | None:
-    """The return of which 90 % are to be reached: as given, else the task's own if known."""
+    """The return that counts as 100 %: the given one, else the task's own if known."""
     return arguments.best if arguments.best is not None else BEST.get(task)
 
 
@@ -365,14 +363,16 @@ def parse(given: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument('--seeds', type=int, nargs='+', default=list(SEEDS))
     parser.add_argument('--methods', nargs='+', choices=list(METHODS))
     parser.add_argument('--workers', type=int, default=1, help='runs at a time')
-    parser.add_argument('--over-topics', action='store_true', help='with nodes, not in process')
+    parser.add_argument(
+        '--over-topics', action='store_true', help='run with nodes, not in process'
+    )
     parser.add_argument('--config', default='quick', help='preset or YAML file')
     parser.add_argument('--task')
     parser.add_argument('--delay', type=int)
     parser.add_argument('--composite')
     parser.add_argument('--steps', type=int)
     parser.add_argument(
-        '--best', type=float, help='return of which 90 %% count as reached; known for the default'
+        '--best', type=float, help='the return that counts as 100 %%; known for the default task'
     )
     parser.add_argument('--out', type=Path, default=RESULTS)
     arguments = parser.parse_args(given)
@@ -389,7 +389,7 @@ def parse(given: Sequence[str] | None) -> argparse.Namespace:
 
 
 def main(given: Sequence[str] | None = None) -> int:
-    """The command line; the exit code."""
+    """Run the command line; returns the exit code."""
     arguments = parse(given)
     failed = 0
     try:
@@ -403,7 +403,7 @@ def main(given: Sequence[str] | None = None) -> int:
         print(f'{os.path.basename(__file__)}: {error}', file=sys.stderr)
         return 2
     if failed:
-        print(f'{failed} runs failed; run again to make them', file=sys.stderr)
+        print(f'{failed} runs failed; the same command makes them again', file=sys.stderr)
     return 1 if failed else 0
 
 

@@ -1,21 +1,21 @@
-"""Everything that only a machine with a GPU can show, in one command and under eight minutes.
+"""Check and measure all that needs a GPU, in one command and under eight minutes, without ROS.
 
     .venv/bin/python benchmarks/gpu_check.py
 
-needs no ROS. The steps, each of which has a time limit of its own:
-  - tests: those of the device paths, `tests/*/test_*device*.py`, the slow ones included
-  - command: `codetr train --in-process --device cuda --reward-device cuda`, as people type it
+The steps, each with a time limit of its own:
+  - tests: those of the device paths, `tests/*/test_*device*.py`, including the slow ones
+  - command: `codetr train --in-process --device cuda --reward-device cuda`, as users type it
   - sac: `sac_gpu.py`, updates per second: eager, replayed, compiled and replayed
   - codetr: `codetr_speed.py`, gradient steps and labels per second, in float32 and bfloat16
-  - profile: `gpu_profile.py`, what host and GPU do in a short run
-  - label_batches: the same labels, some more or fewer at a time
+  - profile: `gpu_profile.py`, the work of host and GPU in a short run
+  - label_batches: the same labels, more or fewer at a time
   - runs: `gpu_runs.py`, short runs, stage by stage: beside a CPU, and with one thing changed
 
-What a step has measured is written at once, and `check.md` after each step: where one fails or is
-cut off, or the `--seconds` of all of them are over, the others' results are there. The exit code
-is 0 only if every step ended by itself and no test failed.
+Each step writes its measurements at once, and `check.md` follows after each step. So if one fails
+or is cut off, or the `--seconds` of all of them are over, the others' results are there. The exit
+code is 0 only if every step ended by itself and no test failed.
 
-Without a GPU, in some minutes, that the script works, and nothing about a GPU:
+Without a GPU this shows in some minutes that the script works, and nothing about a GPU:
 
     .venv/bin/python benchmarks/gpu_check.py --device cpu --smallest --out /tmp/gpu_check
 """
@@ -42,7 +42,7 @@ TESTS = HERE.parent / 'tests'
 RESULTS = HERE / 'results' / 'gpu_check'
 PACKAGES = ('torch', 'numpy', 'mujoco', 'gymnasium')
 LEAST = 5.0
-"""Seconds below which no step is begun."""
+"""No step begins with fewer seconds left."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +50,10 @@ class Step:
     """A command that measures something.
 
     Attributes:
-        name: what people call it, and its log.
-        command: what Python runs.
+        name: of the step and of its log.
+        command: the arguments of Python.
         limit: seconds after which it is ended.
-        results: the file in which its numbers are, in the folder of the results.
+        results: the file with its numbers, in the folder of the results.
     """
 
     name: str
@@ -64,23 +64,23 @@ class Step:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a step ended."""
+    """The ending of a step."""
 
     step: Step
-    said: str
+    ending: str
     seconds: float
 
     @property
     def done(self) -> bool:
-        """Whether it ended by itself, and well."""
-        return self.said == 'done'
+        """Whether it ended by itself without an error."""
+        return self.ending == 'done'
 
 
 def steps(device: str, smallest: bool, out: Path) -> list[Step]:
     """The steps of a check, in order.
 
     Args:
-        device: where everything is measured.
+        device: the device to measure.
         smallest: only show that the scripts work.
         out: the folder of the results.
     """
@@ -118,11 +118,11 @@ def steps(device: str, smallest: bool, out: Path) -> list[Step]:
 
 
 def run(step: Step, seconds: float, out: Path) -> Outcome:
-    """Run a step for as long as it may; what it says goes to its log.
+    """Run a step for as long as it may; its output goes to its log.
 
     Args:
         step: the step.
-        seconds: that are left for it and all that follows.
+        seconds: left for it and all steps after it.
         out: the folder of the results.
     """
     limit = min(step.limit, seconds)
@@ -141,18 +141,18 @@ def run(step: Step, seconds: float, out: Path) -> Outcome:
         )
         try:
             code = process.wait(limit)
-            said = 'done' if code == 0 else f'failed with exit code {code}, see its log'
+            ending = 'done' if code == 0 else f'failed with exit code {code}, see its log'
         except subprocess.TimeoutExpired:
-            said = f'cut off after {limit:.0f} s'
+            ending = f'cut off after {limit:.0f} s'
         finally:
-            with suppress(ProcessLookupError):  # nothing that it has started is left
+            with suppress(ProcessLookupError):  # ends everything that the step has started
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
-    return Outcome(step, said, time.monotonic() - began)
+    return Outcome(step, ending, time.monotonic() - began)
 
 
 def tests_of(report: Path) -> list[dict[str, str]]:
-    """What each test did, from pytest's report."""
+    """The outcome of each test, from pytest's report."""
     rows = []
     for case in ElementTree.parse(report).getroot().iter('testcase'):
         kinds = {child.tag: child for child in case}
@@ -166,14 +166,16 @@ def tests_of(report: Path) -> list[dict[str, str]]:
 
 
 def write(outcomes: list[Outcome], facts: dict[str, str], out: Path) -> None:
-    """The table of what was done until now, and the tests."""
+    """Write the table of the steps done until now, and of the tests."""
     lines = ['# What only a GPU can show', '']
     lines += [f'- {name}: {value}' for name, value in facts.items()]
     lines += ['', '| step | ended | s | numbers |', '|---|---|---:|---|']
     for outcome in outcomes:
         file = outcome.step.results
         link = f'[{file}]({file})' if file and (out / file).is_file() else ''
-        lines.append(f'| {outcome.step.name} | {outcome.said} | {outcome.seconds:.0f} | {link} |')
+        lines.append(
+            f'| {outcome.step.name} | {outcome.ending} | {outcome.seconds:.0f} | {link} |'
+        )
     if (report := out / 'logs' / 'tests.xml').is_file():
         rows = tests_of(report)
         with (out / 'tests.csv').open('w', newline='') as file:
@@ -192,7 +194,7 @@ def write(outcomes: list[Outcome], facts: dict[str, str], out: Path) -> None:
 
 
 def check(planned: list[Step], seconds: float, facts: dict[str, str], out: Path) -> list[Outcome]:
-    """Take all steps, as far as the seconds go, and write after each what is there."""
+    """Take all steps for which there is time, and write the results after each."""
     out.mkdir(parents=True, exist_ok=True)
     ends = time.monotonic() + seconds
     outcomes: list[Outcome] = []
@@ -200,12 +202,12 @@ def check(planned: list[Step], seconds: float, facts: dict[str, str], out: Path)
         print(f'{step.name} ...', flush=True)
         outcomes.append(run(step, ends - time.monotonic(), out))
         write(outcomes, facts, out)
-        print(f'{step.name}: {outcomes[-1].said} ({outcomes[-1].seconds:.0f} s)', flush=True)
+        print(f'{step.name}: {outcomes[-1].ending} ({outcomes[-1].seconds:.0f} s)', flush=True)
     return outcomes
 
 
 def main() -> int:
-    """The command line; the exit code."""
+    """Run the command line; returns the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,11 +1,11 @@
-"""What do host and GPU do in a short run that learns on a GPU?
+"""How do host and GPU spend their time in a short run that learns on a GPU?
 
     .venv/bin/python benchmarks/gpu_profile.py
 
 Two looks at a run of `gpu_runs.py`, group `options`, run `graph`:
-  - host: the functions with the most time of their own in 5000 steps, by Python's profiler, which
-    makes what calls many small functions look slower than it is; who waits for the GPU is seen as
-    the function that waits
+  - host: the functions with the most time of their own in 5000 steps, by Python's profiler. It
+    makes callers of many small functions look slower than they are. A wait for the GPU appears as
+    time of the function that waits
   - GPU: the kernels of a gradient step of the reward transformer, of 64 segments of 25 steps, and
     of the labelling of 100 000 steps, by torch's profiler
 
@@ -32,7 +32,7 @@ def host(device: str, smallest: bool) -> str:
     """The functions with the most time of their own in a run."""
     variant = next(v for v in variants(device) if (v.group, v.name) == ('options', 'graph'))
     shorter = Variant('', '', variant.changes | {'steps': 5000})
-    one_run(shorter, device, smallest=True)  # does not count
+    one_run(shorter, device, smallest=True)  # not counted
     profiler = cProfile.Profile()
     settings = settings_of(shorter, smallest)
     profiler.runcall(in_process.run, settings, 'run')
@@ -50,7 +50,7 @@ def host(device: str, smallest: bool) -> str:
 
 
 def kernels(device: str, smallest: bool, precision: str) -> str:
-    """What the device does for a gradient step, and to label."""
+    """The kernels of a gradient step and of labelling."""
     changes = {'reward_device': device, 'codetr.precision': precision, 'delay': 25}
     changes |= {'codetr.layers': 1, 'codetr.embedding': 16} if smallest else {}
     work = Work(load('paper').changed(changes | {'codetr.label_batch': 4096}))
@@ -67,7 +67,7 @@ def kernels(device: str, smallest: bool, precision: str) -> str:
 
 
 def main() -> int:
-    """The command line; the exit code."""
+    """Run the command line; returns the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,24 +1,24 @@
-"""Short runs, stage by stage: what a GPU brings, and what each thing that can be switched does.
+"""Short runs, stage by stage: the effect of a GPU and of each switch.
 
     .venv/bin/python benchmarks/gpu_runs.py
 
-All runs are made in one process, in process (`codetr train --in-process` without its summary),
-with networks of the paper's size on HalfCheetah-v5, SAC and the reward transformer both on the
-device. A round goes through all of them in turn, every other round backwards, as long
-as there is time for another. Groups:
+All runs are made in one process (`codetr train --in-process` without its summary), with networks
+of the paper's size on HalfCheetah-v5, and both SAC and the reward transformer on the device. A
+round goes through all of them in turn, every other round backwards, as long as there is time for
+another. Groups:
   - device: 2000 steps on the CPU with one thread, after the first round only, and on the device
-  - options: 6000 steps: SAC's graph, the same compiled before, bfloat16 (and with cuDNN's
-    attention), 256 segments labelled at a time
+  - options: 6000 steps: SAC's graph, the same compiled, bfloat16 (also with cuDNN's attention),
+    256 segments labelled at a time
 
-The recorded results have two groups more, of what they led to remove: steps of Gymnasium's
-environments without what nobody reads (`steps`), and threads for the environments of a simulator
-(`threads`). See docs/decisions.
+The recorded results have two more groups, of options that were removed because of them: steps of
+Gymnasium's environments without their unread parts (`steps`), and threads for the environments of
+a simulator (`threads`). See docs/decisions.
 
-Columns: seconds from the first permission to simulate to the end, and of them what each stage
-took; `else` is messages, policies and checkpoints. In process evaluation takes its turn between
-two gradient steps or bursts, so that `fit` and `update` hold some of its seconds a second time
-where a run is evaluated: `else` is left empty there. `GPU busy` is the share of time in which the
-driver saw a kernel run. The median round, and the lowest and highest in brackets.
+Columns: seconds from the first permission to simulate to the end, and those of each stage; `else`
+is messages, policies and checkpoints. In process, evaluation takes its turn between two gradient
+steps or bursts. So if a run is evaluated, `fit` and `update` hold some of its seconds a second
+time, and `else` is left empty. `GPU busy` is the share of time in which the driver saw a kernel
+run. The table gives the median round, and the lowest and highest in brackets.
 """
 
 import argparse
@@ -47,7 +47,7 @@ from sac_gpu import device_facts
 
 RESULTS = Path(__file__).parent / 'results' / 'gpu_check'
 STAGES = ('simulate', 'fit', 'label', 'update')
-"""What the parts of a run say of their work, in metrics NAME_seconds."""
+"""The stages of a run, whose times are the metrics NAME_seconds."""
 WORK = {'fit': 'gradient_steps', 'update': 'updates'}
 SMALL = {'phase_steps': 100, 'codetr.layers': 1, 'codetr.embedding': 16, 'sac.hidden': (16,)}
 
@@ -57,11 +57,11 @@ class Variant:
     """A run that is compared with the others of its group.
 
     Attributes:
-        group: with what it is compared.
-        name: what is different about it.
+        group: the runs that it is compared with.
+        name: its difference from them.
         changes: of the settings.
         cudnn: whether cuDNN may do the reward transformer's attention.
-        once: after the first round only.
+        once: run after the first round only.
     """
 
     group: str
@@ -100,7 +100,7 @@ def settings_of(variant: Variant, smallest: bool) -> Settings:
 
 
 class Watch:
-    """Looks at a run's records and at the clock, and at the GPU while it runs."""
+    """Measures a run by its records and the clock, and samples the GPU while it runs."""
 
     def __init__(self, device: str) -> None:
         self.began: float | None = None
@@ -110,7 +110,7 @@ class Watch:
         self._over = threading.Event()
 
     def receive(self, record: Record) -> None:
-        """Note the first permission, and what the stages say."""
+        """Note the first permission, and the metrics of the stages."""
         if isinstance(record, Policy) and self.began is None:
             self.began = time.perf_counter()
         if isinstance(record, Metrics):
@@ -121,7 +121,7 @@ class Watch:
 
     @contextmanager
     def sampling(self) -> Iterator[None]:
-        """Ask the driver ten times a second how busy the GPU is, if it can be asked."""
+        """Ask the driver ten times a second how busy the GPU is, if NVML is there."""
         thread = threading.Thread(target=self._sample, daemon=True)
         if self._device != 'cpu':
             thread.start()
@@ -142,7 +142,7 @@ class Watch:
                 return
 
     def row(self) -> dict[str, float | str]:
-        """What was noted, once the run is over."""
+        """The measurements, once the run is over."""
         assert self.began is not None
         row: dict[str, float | str] = {'seconds': time.perf_counter() - self.began}
         row |= {stage: self.totals[f'{stage}_seconds'] for stage in STAGES}
@@ -154,7 +154,7 @@ class Watch:
 
 @contextmanager
 def switched(variant: Variant) -> Iterator[None]:
-    """The library as a variant has it."""
+    """Switch the library to a variant for a while."""
     kernels = list(transformer.KERNELS)
     if variant.cudnn:
         transformer.KERNELS.append(SDPBackend.CUDNN_ATTENTION)
@@ -165,7 +165,7 @@ def switched(variant: Variant) -> Iterator[None]:
 
 
 def one_run(variant: Variant, device: str, smallest: bool) -> dict[str, float | str]:
-    """One run of a variant; what it took."""
+    """Do one run of a variant; returns its measurements."""
     settings, watch = settings_of(variant, smallest), Watch(device)
     with switched(variant), tempfile.TemporaryDirectory() as folder, watch.sampling():
         reports = in_process.run(settings, 'run', Path(folder), watch.receive)
@@ -205,7 +205,7 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def write(rows: list[dict[str, Any]], facts: dict[str, str], out: Path) -> None:
-    """The CSV file of all runs, and the table."""
+    """Write the CSV file of all runs, and the table."""
     out.mkdir(parents=True, exist_ok=True)
     with (out / 'runs.csv').open('w', newline='') as file:
         writer = csv.DictWriter(file, list(rows[0]))
@@ -220,14 +220,18 @@ def write(rows: list[dict[str, Any]], facts: dict[str, str], out: Path) -> None:
 
 
 def main() -> int:
-    """The command line; the exit code."""
+    """Run the command line; returns the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument('--device', default='cuda')
-    parser.add_argument('--seconds', type=float, default=205, help='no round that would end later')
+    parser.add_argument(
+        '--seconds', type=float, default=205, help='begin no round that would end later'
+    )
     parser.add_argument('--rounds', type=int, default=5, help='at most')
-    parser.add_argument('--groups', nargs='+', metavar='GROUP', help='those that begin so')
+    parser.add_argument(
+        '--groups', nargs='+', metavar='GROUP', help='run only the groups that begin with this'
+    )
     parser.add_argument('--smallest', action='store_true', help='only show that it works')
     parser.add_argument('--out', type=Path, default=RESULTS)
     arguments = parser.parse_args()
@@ -239,7 +243,7 @@ def main() -> int:
         if any(map(variant.group.startswith, arguments.groups or ['']))
     ]
     began = time.monotonic()
-    # does not count: what libraries set up at their first use
+    # not counted: the set-up of libraries at their first use
     one_run(Variant('', '', chosen[-1].changes), device, smallest=True)
     rows: list[dict[str, Any]] = []
 

@@ -1,16 +1,16 @@
-"""Does a run stay as fast, and as small per step, when it gets long?
+"""Does a run keep its speed, and its memory per step, when it gets long?
 
     .venv/bin/python benchmarks/growth.py                    # on an idle machine, 10 to 20 minutes
 
-Runs over topics of 10 000, 100 000 and 1 000 000 steps that keep every step in memory. So that a
-million steps take minutes, nearly nothing is learnt (method uniform, one update of a tiny network
-in a hundred steps): what is left is what a run costs around the learning, which is all that grows
-with it. What CoDeTr and the other reward models spend on labelling all of D again grows with D by
+Makes runs over topics of 10 000, 100 000 and 1 000 000 steps that keep every step in memory. They
+learn nearly nothing (method uniform, one update of a tiny network in a hundred steps), so that a
+million steps take minutes. The rest is the cost of a run around the learning, and only that can
+grow with its length. The time that reward models spend on labelling all of D again grows with D by
 design; `codetr_speed.py` measures it.
 
 For each run: seconds until the first permission; steps per second from there to the last commit,
 of the whole loop and of its last tenth; peak memory of each process; bytes of the bag. Memory and
-bag per step are those between two lengths: what is there with no step at all is left out.
+bag per step are differences between two lengths, without the part that does not grow.
 
 Writes `results/growth.csv` and `results/growth.md`.
 """
@@ -43,7 +43,7 @@ COLUMNS = ('steps', 'what', 'unit', 'value')
 
 
 def one_run(steps: int) -> dict[str, Any]:
-    """Make a run; what it took."""
+    """Make a run; returns its measurements."""
     with tempfile.TemporaryDirectory(prefix='codetr-growth-') as where:
         out = Path(where) / 'run'
         command = [sys.executable, '-m', 'codetr_ros.cli', 'train', '--out', str(out)]
@@ -66,14 +66,14 @@ def one_run(steps: int) -> dict[str, Any]:
         'lost': summary['lost'],
         'bag': size,
         'memory': {
-            said['role']: 1e6 * said['peak_rss_mb'] * 1.048576
-            for said in summary['processes'].values()
+            process['role']: 1e6 * process['peak_rss_mb'] * 1.048576
+            for process in summary['processes'].values()
         },
     }
 
 
 def rows_of(lengths: Sequence[int], runs: Sequence[dict[str, Any]]) -> list[tuple[Any, ...]]:
-    """What was found, one number a row."""
+    """The measurements, one number a row."""
     rows: list[tuple[Any, ...]] = []
     for i, (steps, run) in enumerate(zip(lengths, runs, strict=True)):
         rows += [
@@ -99,23 +99,23 @@ def rows_of(lengths: Sequence[int], runs: Sequence[dict[str, Any]]) -> list[tupl
 
 def table(lengths: Sequence[int], rows: list[tuple[Any, ...]], facts: dict[str, str]) -> str:
     """One column for each length."""
-    found: dict[tuple[str, str], dict[int, float]] = {}
+    by_row: dict[tuple[str, str], dict[int, float]] = {}
     for steps, what, unit, value in rows:
-        found.setdefault((what, unit), {})[steps] = value
+        by_row.setdefault((what, unit), {})[steps] = value
     lines = [
         '# Growth',
         '',
         f'| | | {" | ".join(f"{n:,} steps".replace(",", " ") for n in lengths)} |',
         '|---|---|' + '---:|' * len(lengths),
     ]
-    for (what, unit), values in found.items():
+    for (what, unit), values in by_row.items():
         cells = [f'{values[n]:.4g}' if n in values else '' for n in lengths]
         lines.append(f'| {what} | {unit} | {" | ".join(cells)} |')
     return '\n'.join([*lines, '', *(f'- {name}: {fact}' for name, fact in facts.items())]) + '\n'
 
 
 def main() -> int:
-    """The command line; the exit code."""
+    """Run the command line; returns the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

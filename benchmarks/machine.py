@@ -1,4 +1,4 @@
-"""Where and of what a benchmark's numbers were measured: what stands beside every table here."""
+"""The machine, versions and commit of a measurement, which stand beside every table here."""
 
 import os
 import platform
@@ -14,12 +14,12 @@ LOUD = 0.5
 
 
 def commit(checkout: Path = HERE) -> str:
-    """The commit that is measured, marked where tracked files other than results have changed.
+    """The measured commit, marked if tracked files other than results have changed.
 
-    A copy without git's folder, on a machine that cannot fetch, is told it by `CODETR_COMMIT`.
+    `CODETR_COMMIT` names it for a copy without git's folder, on a machine that cannot fetch.
     """
-    if checkout == HERE and (told := os.environ.get('CODETR_COMMIT')):
-        return told
+    if checkout == HERE and (given := os.environ.get('CODETR_COMMIT')):
+        return given
 
     def git(*arguments: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
@@ -32,7 +32,7 @@ def commit(checkout: Path = HERE) -> str:
 
 
 def processor() -> str:
-    """The processor's name, as far as the system tells."""
+    """The processor's name, as far as the system knows it."""
     if (info := Path('/proc/cpuinfo')).is_file():
         for line in info.read_text().splitlines():
             if line.startswith('model name'):
@@ -41,9 +41,7 @@ def processor() -> str:
 
 
 def load() -> str:
-    """The load average of the last minute: ask at the start. Says where it is not an idle
-    machine's.
-    """
+    """The load average of the last minute, marked if the machine is not idle. Call it first."""
     average = os.getloadavg()[0]
     return f'{average:.2f}' + (' (the machine was NOT idle)' if average > LOUD else '')
 
@@ -55,7 +53,7 @@ def cpu_seconds(process: int) -> float:
         process: Its number.
 
     Raises:
-        OSError: It is not there any more.
+        OSError: It has ended.
     """
     stat = Path(f'/proc/{process}/stat').read_text()
     ticks = map(int, stat.rpartition(')')[2].split()[11:13])  # user, system
@@ -69,10 +67,10 @@ def spread(values: Sequence[float], form: str) -> str:
 
 
 def facts(load_at_start: str, packages: Iterable[str] = ()) -> dict[str, str]:
-    """What the numbers depend on, by name.
+    """The facts on which the numbers depend, by name.
 
     Args:
-        load_at_start: What `load` said before the measurement.
+        load_at_start: The result of `load` before the measurement.
         packages: Distributions whose versions matter.
     """
     return {

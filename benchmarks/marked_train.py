@@ -1,11 +1,11 @@
-"""`codetr train --in-process` that also notes when its loop began and ended; for `throughput.py`.
+"""Run `codetr train --in-process` and note when its loop begins and ends, for `throughput.py`.
 
     python benchmarks/marked_train.py MARKS train [FLAGS]
 
-writes to the file MARKS when the first permission to simulate was given and when the last phase
-was committed, in nanoseconds. No file of an in-process run says so, but its summary is handed
-every record. Nothing is imported before the command that the command would not import itself, so
-that the command's own times stay what they are.
+writes to the file MARKS the times of the first permission to simulate and of the last phase's
+commit, in nanoseconds. No file of an in-process run holds these times, but its summary receives
+every record. The script imports only modules that the command imports itself, so that the
+command's own times do not change.
 """
 
 import json
@@ -18,26 +18,26 @@ from codetr_ros.records import Commit, Policy, Record
 
 
 class Marks(train.Summary):
-    """A summary that looks at the clock."""
+    """A summary that notes times."""
 
-    found: dict[type, int] = {}
+    times: dict[type, int] = {}
 
     def receive(self, record: Record) -> None:
         """Note the first permission and the latest commit."""
         if isinstance(record, Policy):
-            self.found.setdefault(Policy, time.time_ns())
+            self.times.setdefault(Policy, time.time_ns())
         elif isinstance(record, Commit):
-            self.found[Commit] = time.time_ns()
+            self.times[Commit] = time.time_ns()
         super().receive(record)
 
 
 def main() -> int:
-    """The command line; the command's exit code."""
+    """Run the command line; returns the command's exit code."""
     path, _, *arguments = sys.argv[1:]
     train.Summary = Marks
     code = train.main([*arguments, '--in-process'])
     if code == 0:
-        Path(path).write_text(json.dumps([Marks.found[Policy], Marks.found[Commit]]))
+        Path(path).write_text(json.dumps([Marks.times[Policy], Marks.times[Commit]]))
     return code
 
 

@@ -1,17 +1,17 @@
-"""What does a process take that holds a million steps of Ant?
+"""How much memory does a process take that holds a million steps of Ant?
 
     .venv/bin/python benchmarks/memory.py
 
 Each measurement is a process of its own that fills the memory D with steps of Ant (27 or 105
-observations, 8 actions, delay 25) and does what its role does with it:
+observations, 8 actions, delay 25) and does the work of its role with it:
   - learner: every step is labelled, then SAC updates of the preset `paper` draw from it
   - reward: every segment is scored, then CoDeTr of the preset `paper` takes the moments of all
     observations, two gradient steps, and labels 2560 segments
 
-Episodes have 1000 steps or, every second one, 50 to 450. Peak is the largest resident set that
-the process ever had (`ru_maxrss`), and `bare` what it was before the first step came: Python,
-numpy and torch. `own` are the bytes of the numbers that are stored: observation, action, label,
-its version and two flags of each step. Goal: peak within 1.5 GiB.
+Episodes have 1000 steps or, every second one, 50 to 450. `peak` is the largest resident set of
+the process (`ru_maxrss`), and `bare` its size before the first step: Python, numpy and torch.
+`own` is the size of the stored numbers: observation, action, label, its version and two flags of
+each step. Goal: peak within 1.5 GiB.
 """
 
 import argparse
@@ -40,7 +40,7 @@ def peak() -> float:
 
 
 def episodes(steps: int, rng: np.random.Generator) -> Iterator[tuple[int, int]]:
-    """Number and length of episodes that make up so many steps."""
+    """Number and length of episodes that make up this many steps."""
     number = 0
     while steps:
         length = min(steps, 1000 if number % 2 else int(rng.integers(50, 450)))
@@ -49,7 +49,7 @@ def episodes(steps: int, rng: np.random.Generator) -> Iterator[tuple[int, int]]:
 
 
 def work(role: str, observation: int, steps: int) -> dict[str, Any]:
-    """Fill a memory, use it, and say what this process took."""
+    """Fill a memory and use it; returns the memory that this process took."""
     import torch
 
     from codetr_ros.config import load
@@ -159,9 +159,9 @@ def main() -> None:
             done = subprocess.run(
                 [sys.executable, __file__, *asked], check=True, capture_output=True, text=True
             )
-            found = json.loads(done.stdout)
+            sizes = json.loads(done.stdout)
             rows.append(
-                {'role': role, 'observations': observation, 'steps': arguments.steps} | found
+                {'role': role, 'observations': observation, 'steps': arguments.steps} | sizes
             )
             print(rows[-1], flush=True)
     arguments.out.parent.mkdir(parents=True, exist_ok=True)

@@ -1,17 +1,16 @@
-"""What the node graph itself costs: idle nodes, a phase on its way, overlap, threads.
+"""The costs of the node graph itself: idle nodes, a phase on its way, overlap, threads.
 
     .venv/bin/python benchmarks/nodes.py                   # on an idle machine, 15 minutes
     .venv/bin/python benchmarks/nodes.py --parts idle crossing
 
 idle      CPU of each node, in per cent of a core, while it waits: before a learner has announced
-          a run, and in a run whose learner is stopped (SIGSTOP), so that nobody has work.
-crossing  A phase of 1000 steps of Ant (105 observations), as records in one process until they
-          are records again in another: made into messages, published, received, checked, copied.
-          Beside it the same bytes published and received raw, and copied once within a process.
-runs      Whole runs in rounds, times from the first permission to the last commit: over topics
-          and in process, each in lock-step and with overlap (equal lag, so equal learning), and
-          over topics with two threads per process, and, once, with threads that spin while they
-          wait.
+          a run, and in a run whose learner is stopped (SIGSTOP), so that no node has work.
+crossing  Time of a phase of 1000 steps of Ant (105 observations) from records in one process to
+          records in another: made into messages, published, received, checked, copied. Beside it
+          the same bytes published and received raw, and copied once within a process.
+runs      Whole runs in rounds, timed from the first permission to the last commit: over topics
+          and in process, each in lock-step and with overlap (equal lag, so equal learning); over
+          topics with two threads per process, and, once, with threads that spin while they wait.
 
 Writes `results/nodes.csv` (every round) and `results/nodes.md`.
 """
@@ -42,7 +41,7 @@ RESULTS = Path(__file__).parent / 'results'
 PARTS = ('idle', 'crossing', 'runs')
 COLUMNS = ('part', 'what', 'unit', 'value')
 OBSERVATIONS, ACTIONS, PHASE, DELAY = 105, 8, 1000, 25
-DEADLINE = 120.0  # [s] for anything that is waited for
+DEADLINE = 120.0  # [s] for every wait
 Row = tuple[str, str, str, float]
 
 
@@ -54,7 +53,7 @@ def per_cent(nodes: Iterable[launcher.Node], seconds: float) -> dict[str, float]
     """CPU of each node in per cent of a core over some seconds."""
     watched = [node for node in nodes if node.code is None]
     before, began = [machine.cpu_seconds(node.process.pid) for node in watched], time.monotonic()
-    time.sleep(seconds)  # what is measured is what happens while nothing happens
+    time.sleep(seconds)  # the measurement: nodes that have nothing to do
     spent = time.monotonic() - began
     return {
         node.name: 100 * (machine.cpu_seconds(node.process.pid) - then) / spent
@@ -63,7 +62,7 @@ def per_cent(nodes: Iterable[launcher.Node], seconds: float) -> dict[str, float]
 
 
 def idle(settings: Settings, seconds: float) -> Iterator[Row]:
-    """Nodes that wait for a run, and nodes of a run that stands still."""
+    """CPU of nodes that wait for a run, and of nodes of a run that stands still."""
     from codetr_ros.ros.watch import Watcher
 
     with tempfile.TemporaryDirectory(prefix='codetr-idle-') as where:
@@ -76,13 +75,13 @@ def idle(settings: Settings, seconds: float) -> Iterator[Row]:
         env = launcher.environment(settings)
         committed: list[int] = []
 
-        def hear(record: Record) -> None:
+        def note(record: Record) -> None:
             if isinstance(record, Commit):
                 committed.append(record.phase)
 
-        with launcher.Processes(print) as processes, Watcher(hear, f'/run_{run_id}') as watcher:
+        with launcher.Processes(print) as processes, Watcher(note, f'/run_{run_id}') as watcher:
             processes.start(others, folder / run_folder.LOGS, env)
-            time.sleep(10)  # imports are no waiting
+            time.sleep(10)  # until imports are done
             for name, value in per_cent(processes.running(), seconds).items():
                 yield 'idle', f'{name}, before a run', '% of a core', value
             processes.start(learner, folder / run_folder.LOGS, env)
@@ -96,11 +95,11 @@ def idle(settings: Settings, seconds: float) -> Iterator[Row]:
             stopped = next(n for n in processes.running() if n.role == 'learner').process
             stopped.send_signal(signal.SIGSTOP)
             try:
-                time.sleep(5)  # for what the others have still to do
-                found = per_cent(processes.running(), seconds)
+                time.sleep(5)  # until the others have finished their work
+                used = per_cent(processes.running(), seconds)
             finally:
                 stopped.send_signal(signal.SIGCONT)
-            for name, value in found.items():
+            for name, value in used.items():
                 if name != 'learner':
                     yield 'idle', f'{name}, learner stopped', '% of a core', value
 
@@ -110,7 +109,7 @@ def idle(settings: Settings, seconds: float) -> Iterator[Row]:
 
 
 def a_phase(phase: int) -> list[Record]:
-    """1000 steps of Ant and their scores, in chunks as the simulator makes them."""
+    """1000 steps of Ant and their scores, in the chunks of a simulator."""
     from codetr_ros.simulation.source import chunk_steps
 
     rng = np.random.default_rng(phase)
@@ -155,9 +154,9 @@ def a_phase(phase: int) -> list[Record]:
 
 
 class End:
-    """One of the two processes: publishes phases, and hears them."""
+    """One of the two processes: publishes phases and receives them."""
 
-    def __init__(self, name: str, hears: str, says: str) -> None:
+    def __init__(self, name: str, receives: str, publishes: str) -> None:
         import rclpy
         from codetr_msgs.msg import CompositeReward as ScoreMessage
         from codetr_msgs.msg import Transitions as StepsMessage
@@ -176,22 +175,26 @@ class End:
         profile = qos.profile('transitions', load('paper'))
         self.kinds = {Transitions: StepsMessage, CompositeReward: ScoreMessage}
         self.to = {
-            kind: self.node.create_publisher(message, f'{says}_{kind.__name__}', profile)
+            kind: self.node.create_publisher(message, f'{publishes}_{kind.__name__}', profile)
             for kind, message in self.kinds.items()
         }
         self.inbox: list[Any] = []
         self.raw = False
         for kind, message in self.kinds.items():
             self.node.create_subscription(
-                message, f'{hears}_{kind.__name__}', self.inbox.append, profile
+                message, f'{receives}_{kind.__name__}', self.inbox.append, profile
             )
         self.raw_inbox: list[bytes] = []
         for kind, message in self.kinds.items():
             self.to[kind, 'raw'] = self.node.create_publisher(
-                message, f'{says}_raw_{kind.__name__}', profile
+                message, f'{publishes}_raw_{kind.__name__}', profile
             )
             self.node.create_subscription(
-                message, f'{hears}_raw_{kind.__name__}', self.raw_inbox.append, profile, raw=True
+                message,
+                f'{receives}_raw_{kind.__name__}',
+                self.raw_inbox.append,
+                profile,
+                raw=True,
             )
 
     def matched(self) -> bool:
@@ -199,19 +202,19 @@ class End:
         return all(publisher.get_subscription_count() for publisher in self.to.values())
 
     def publish(self, records: list[Record]) -> None:
-        """As a node publishes."""
+        """Publish records, as a node does."""
         stamp = self.node.get_clock().now().to_msg()
         for record in records:
             self.to[type(record)].publish(self.messages.to_message(record, stamp))
 
-    def hear(self, count: int) -> list[Record]:
-        """As a node takes in: made into records, whose arrays are copies of its own."""
+    def receive(self, count: int) -> list[Record]:
+        """Receive records, as a node does, with their own copies of the arrays."""
         self._wait(self.inbox, count)
         arrived, self.inbox[:] = list(self.inbox), []
         return [self.messages.from_message(message) for message in arrived]
 
-    def hear_raw(self, count: int) -> list[bytes]:
-        """The bytes as they come."""
+    def receive_raw(self, count: int) -> list[bytes]:
+        """Receive messages as raw bytes."""
         self._wait(self.raw_inbox, count)
         arrived, self.raw_inbox[:] = list(self.raw_inbox), []
         return arrived
@@ -221,11 +224,11 @@ class End:
         while len(inbox) < count:
             self.executor.spin_once(timeout_sec=1.0)
             if time.monotonic() > end:
-                raise SystemExit(f'{len(inbox)} of {count} messages came')
+                raise SystemExit(f'{len(inbox)} of {count} messages arrived within {DEADLINE:g} s')
 
 
 def echo() -> None:
-    """The other process: says when everything has arrived, by the clock that both share."""
+    """The other process: prints when everything has arrived, by the clock that both share."""
     end = End('echo', 'there', 'back')
     for line in sys.stdin:
         what, count = line.split()
@@ -233,9 +236,9 @@ def echo() -> None:
             while not end.matched():
                 end.executor.spin_once(timeout_sec=0.05)
         elif what == 'records':
-            end.hear(int(count))
+            end.receive(int(count))
         else:
-            end.hear_raw(int(count))
+            end.receive_raw(int(count))
         print(time.monotonic(), flush=True)
 
 
@@ -264,7 +267,7 @@ def crossing(phases: int) -> Iterator[Row]:
         for number in range(phases + 5):
             records = a_phase(number)
             ask('records', len(records))
-            time.sleep(0.02)  # until it waits: a node that is in the middle of something is slower
+            time.sleep(0.02)  # until it waits: a busy node is slower
             began = time.monotonic()
             end.publish(records)
             took = float(other.stdout.readline()) - began
@@ -282,7 +285,7 @@ def crossing(phases: int) -> Iterator[Row]:
             began = time.monotonic()
             bytes(whole)
             copied = time.monotonic() - began
-            if number >= 5:  # the first ones warm caches up
+            if number >= 5:  # the first ones warm up caches
                 yield 'crossing', 'a phase, records to records', 'ms', 1e3 * took
                 yield 'crossing', 'a phase, raw bytes', 'ms', 1e3 * took_raw
                 yield 'crossing', 'a phase, copied in memory', 'ms', 1e3 * copied
@@ -307,7 +310,7 @@ def runs(steps: int, rounds: int) -> Iterator[Row]:
     flags = ['--config', 'quick', '--steps', str(steps)]
     overlap = [*flags, '--overlap']
     two = [*overlap, '--threads', '2']
-    # as threads wait without the environment that `codetr train` gives its processes
+    # threads wait like this without the environment of `codetr train`
     spin = {'GOMP_SPINCOUNT': 'infinity'}
     ways: dict[str, tuple[list[str], bool, dict[str, str]]] = {
         'in process, lock-step': (flags, True, {}),
@@ -320,12 +323,12 @@ def runs(steps: int, rounds: int) -> Iterator[Row]:
     for number in range(rounds):
         for way, (given, in_process, environ) in ways.items():
             if environ and number:
-                continue  # takes minutes, and is no close call
+                continue  # takes minutes, and the difference is large
             os.environ.update(environ)
-            found = throughput.whole_run(given, in_process)
+            times = throughput.whole_run(given, in_process)
             for name in environ:
                 del os.environ[name]
-            yield 'runs', way, 's', found['loop']
+            yield 'runs', way, 's', times['loop']
 
 
 # ----------------------------------------------------------------------------------------------
@@ -333,16 +336,16 @@ def runs(steps: int, rounds: int) -> Iterator[Row]:
 
 def table(rows: list[Row], facts: dict[str, str]) -> str:
     """Median, lowest and highest of everything."""
-    found: dict[tuple[str, str, str], list[float]] = {}
+    by_row: dict[tuple[str, str, str], list[float]] = {}
     for part, what, unit, value in rows:
-        found.setdefault((part, what, unit), []).append(value)
+        by_row.setdefault((part, what, unit), []).append(value)
     lines = [
         '# What the node graph costs',
         '',
         '| part | what | unit | rounds | median | lowest | highest |',
         '|---|---|---|---:|---:|---:|---:|',
     ]
-    for (part, what, unit), values in found.items():
+    for (part, what, unit), values in by_row.items():
         numbers = statistics.median(values), min(values), max(values)
         cells = ' | '.join(f'{number:.4g}' for number in numbers)
         lines.append(f'| {part} | {what} | {unit} | {len(values)} | {cells} |')
@@ -350,15 +353,15 @@ def table(rows: list[Row], facts: dict[str, str]) -> str:
 
 
 def main() -> int:
-    """The command line; the exit code."""
+    """Run the command line; returns the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument('--parts', nargs='+', choices=PARTS, default=list(PARTS))
-    parser.add_argument('--seconds', type=float, default=10.0, help='idle: how long to look')
-    parser.add_argument('--phases', type=int, default=100, help='crossing')
-    parser.add_argument('--steps', type=int, default=6000, help='of each run')
-    parser.add_argument('--rounds', type=int, default=3, help='of runs')
+    parser.add_argument('--seconds', type=float, default=10.0, help='idle: how long to measure')
+    parser.add_argument('--phases', type=int, default=100, help='crossing: number of phases')
+    parser.add_argument('--steps', type=int, default=6000, help='runs: steps of each')
+    parser.add_argument('--rounds', type=int, default=3, help='runs: number of rounds')
     parser.add_argument('--out', type=Path, default=RESULTS)
     parser.add_argument('--echo', action='store_true', help=argparse.SUPPRESS)
     given = parser.parse_args()

@@ -1,23 +1,23 @@
-"""What does recording cost? The same run with a bag and without one, pair by pair.
+"""How much does recording cost? The same run with a bag and without one, pair by pair.
 
     .venv/bin/python benchmarks/recording_overhead.py
 
 Every run has all of its nodes as processes, as `codetr train` starts them. A: the recorder writes
 a bag, synced to the disk before each commit. B: it has no folder, so it keeps the last phases in
-memory and commits from there. The order alternates (A B, B A, ...), so that what drifts hits both.
-For each run are given
+memory and commits from there. The order alternates (A B, B A, ...), so that drift affects both.
+The numbers of each run are
 
-  - loop: seconds from the first commit to the learner's last word, as a watcher hears them; what
-    starting and ending take is left out
-  - rest: the loop less what the nodes say that they simulated, fitted, labelled and learnt. In
-    lock-step one of them works at a time, so that what is left is transport and the recorder:
-    whatever recording costs the others is in here. How fast one and the same program learns
-    differs by several per cent from process to process, by chance, and does not disturb it
+  - loop: seconds from the first commit to the learner's last metrics, as a watcher receives them,
+    without start and end
+  - rest: the loop less the times that the nodes report for simulating, fitting, labelling and
+    learning. In lock-step one of them works at a time, so the rest is transport and the recorder,
+    with all costs of recording to the others. The speed of learning differs by chance, by several
+    per cent from process to process, and does not disturb the rest
   - recorder: CPU seconds of the recorder's process
-  - sync: seconds that the recorder says it spent in syncing before commits (with a bag only)
+  - sync: seconds that the recorder reports for syncing before commits (with a bag only)
 
 Recording costs (rest with a bag - rest without) / loop in time, and the same of `recorder` in
-CPU. The ratio of the loops themselves is given too: it is as uncertain as its range shows.
+CPU. The ratio of the loops themselves is also given, with its range.
 """
 
 import argparse
@@ -40,7 +40,7 @@ from codetr_ros.runs import folder as run_folder
 RESULTS = Path(__file__).parent / 'results' / 'recording_overhead.md'
 DEADLINE = 1800.0  # [s] for one run
 WORK = ('simulate_seconds', 'fit_seconds', 'label_seconds', 'update_seconds')
-"""What nodes say of their own work in `Metrics`; evaluation delays nobody."""
+"""The metrics of the nodes' work; evaluation is left out, because it delays no node."""
 
 
 class Run(NamedTuple):
@@ -54,7 +54,7 @@ class Run(NamedTuple):
 
 
 class Clock:
-    """When the first commit and the learner's last metrics were heard, and the work between."""
+    """The times of the first commit and of the learner's last metrics, and the work between."""
 
     def __init__(self, phases: int) -> None:
         self._last = 'learner', phases - 1
@@ -62,17 +62,17 @@ class Clock:
         self.last: float | None = None
         self.work = 0.0
 
-    def hear(self, record: Record) -> None:
-        """Take note of a record."""
+    def receive(self, record: Record) -> None:
+        """Note the time and work of a record."""
         if isinstance(record, Commit) and self.first is None:
             self.first = time.perf_counter()
         if not isinstance(record, Metrics):
             return
         if (record.role, record.phase) == self._last:
             self.last = time.perf_counter()
-        if (record.role, record.phase) != ('sim', 0):  # was over before the first commit
-            said = dict(zip(record.names, record.values.tolist(), strict=True))
-            self.work += sum(said.get(name, 0.0) for name in WORK)
+        if (record.role, record.phase) != ('sim', 0):  # ended before the first commit
+            metrics = dict(zip(record.names, record.values.tolist(), strict=True))
+            self.work += sum(metrics.get(name, 0.0) for name in WORK)
 
 
 def without_folder(command: launcher.Command) -> launcher.Command:
@@ -95,7 +95,7 @@ def one_run(settings: Settings, bag: bool, number: int) -> Run:
             commands = [without_folder(c) if c.role == 'record' else c for c in commands]
         with (
             launcher.Processes(print) as processes,
-            Watcher(clock.hear, f'/run_{run_id}') as watcher,
+            Watcher(clock.receive, f'/run_{run_id}') as watcher,
         ):
             processes.start(commands, folder / run_folder.LOGS, launcher.environment(settings))
             end = time.monotonic() + DEADLINE
@@ -107,7 +107,7 @@ def one_run(settings: Settings, bag: bool, number: int) -> Run:
         if failed := processes.failed():
             raise SystemExit(f'{failed.how_it_ended()}\n{launcher.end_of_log(failed.log)}')
         if clock.first is None or clock.last is None:
-            raise SystemExit('the first commit or the last metrics were not heard')
+            raise SystemExit('the first commit or the last metrics did not arrive')
         sync, size = 0.0, 0.0
         if bag:
             path = run_folder.report_path(folder, 'record', 'record')
@@ -128,7 +128,7 @@ def cpu_of(node: launcher.Node) -> float:
 
 
 def table(pairs: list[tuple[Run, Run]], facts: dict[str, str]) -> str:
-    """All pairs, and what they come to."""
+    """All pairs, and their summary."""
     names = ('loop', 'rest', 'recorder')
     head = [f'{name} {how} [s]' for name in names for how in ('with', 'without')]
     lines = [
@@ -158,12 +158,12 @@ def table(pairs: list[tuple[Run, Run]], facts: dict[str, str]) -> str:
 
 
 def main() -> int:
-    """The command line; the exit code."""
+    """Run the command line; returns the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument('--config', default='quick', help='preset or YAML file')
-    parser.add_argument('--steps', type=int, help='of a run; as the config says if not given')
+    parser.add_argument('--steps', type=int, help='of a run; by default as in the config')
     parser.add_argument('--pairs', type=int, default=5)
     parser.add_argument('--out', type=Path, default=RESULTS)
     given = parser.parse_args()

@@ -1,22 +1,21 @@
-"""Are the inferred step rewards the true ones? Reward recovery on held-out episodes of
-HalfCheetah.
+"""Are the inferred step rewards the true ones? Reward recovery on held-out episodes.
 
     .venv/bin/python benchmarks/reward_recovery.py --out benchmarks/results/reward_recovery.csv
 
-The data is the replay of a true-reward run of 20 000 steps (small networks), so that it ranges
-from random to running. Four fifths of its episodes train each model on nothing but composite
-rewards of 25 steps; the last fifth, every fifth episode, is held out. For each composite reward
-and each variant (CoDeTr, changed in one setting, or another method) it gives
+The data is the replay of a true-reward run of 20 000 steps on HalfCheetah (small networks), so
+that it ranges from random to running. Four fifths of its episodes train each model, only with
+composite rewards of 25 steps; every fifth episode is held out. For each composite reward and each
+variant (CoDeTr, changed in one setting, or another method) it gives
 
     composite_r2       R^2 of the predicted composite reward; nan for methods that predict none
     pearson, spearman  correlation of inferred and true step rewards
     within_pearson     the same with each segment's mean removed from both: is credit right inside
-    within_spearman    the segment? nan for methods that give all of its steps the same
+    within_spearman    the segment? nan for methods that give the same to all of its steps
     weights_sd         standard deviation of CoDeTr's attention weights w (1 on average)
 
-over held-out steps. A high R^2 says little about the steps, which is why the others are here.
-`ircr` and `uniform` take no gradient steps, whatever the column says.
-Rows that are in the file already are not run again. Means over seeds go beside it as Markdown.
+over held-out steps. A high R^2 shows little about the steps, hence the other columns. `ircr` and
+`uniform` take no gradient steps, whatever the value in their column. Rows that are in the file
+already are not run again. Means over seeds go beside it as Markdown.
 """
 
 import argparse
@@ -83,7 +82,7 @@ COLUMNS = (
 
 
 def replay(cache: Path, steps: int = 20_000) -> dict[str, np.ndarray]:
-    """The true-reward run's steps: made once, kept in `cache`."""
+    """The true-reward run's steps, made once and kept in `cache`."""
     if not cache.is_file():
         settings = load('quick').changed(
             {

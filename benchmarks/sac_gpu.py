@@ -1,25 +1,25 @@
-"""How fast does SAC learn on a GPU, and what is left of an update there?
+"""How fast does SAC learn on a GPU, and which kernels does an update take there?
 
     .venv/bin/python benchmarks/sac_gpu.py
 
-Compared, for batches of 256 from a memory of a million labelled steps and networks of 256x256, of
-the sizes of Ant (27 or 105 observations, 8 actions) and HalfCheetah (17, 6):
-  - eager: the host asks for every operation of an update
+Networks have 256x256 units; batches of 256 come from a memory of a million labelled steps of the
+sizes of Ant (27 or 105 observations, 8 actions) and HalfCheetah (17, 6). Compared are:
+  - eager: the host launches every operation of an update
   - graph: the operations are recorded once and replayed (`device=cuda`, `sac.compile=false`)
-  - compiled graph: they are compiled before (`device=cuda`, `sac.compile=true`)
+  - compiled graph: they are compiled first (`device=cuda`, `sac.compile=true`)
 
-A round goes through all of them in turn, with as many updates as `--updates` says, from the first
-call until the GPU has done the last of them. The table gives the median round, and the lowest and
-highest in brackets. `phase` is what the host does between two phases of 1000 steps: it copies what
-is new and all labels, and finds out which steps are labelled; `first` is the first time, with all
-of the memory and the recording; `made` is the making of a learner, compiling included.
+A round goes through all of them in turn, with `--updates` updates each, timed from the first call
+until the GPU has done the last of them. The table gives the median round, and the lowest and
+highest in brackets. `phase` is the host's work between two phases of 1000 steps: it copies the new
+steps and all labels, and finds out which steps are labelled. `first` is the first such time, with
+all of the memory and the recording; `made` is the making of a learner, including compiling.
 
-A profile of some updates follows, by the time that kernels take on the GPU: how many kernels an
-update has, and which ones take longest. Of replayed graphs profilers have been seen to miss or
-misplace kernels: where the profile and the rate disagree, the rate is right.
+A profile of some updates follows, by the time of kernels on the GPU: the number of kernels of an
+update, and those that take longest. Profilers have been seen to miss or misplace kernels of
+replayed graphs: where the profile and the rate disagree, the rate is right.
 
-Without a GPU `--device cpu --steps 3000 --updates 3` shows that the script works: eager only, and
-with nothing to be learnt about a GPU.
+Without a GPU `--device cpu --steps 3000 --updates 3` shows that the script works, with the eager
+form only, and nothing about a GPU.
 """
 
 import argparse
@@ -59,7 +59,7 @@ class Run:
         self.label()
 
     def phase(self) -> None:
-        """One more episode; the oldest goes where the memory is full."""
+        """Add an episode; the oldest goes if the memory is full."""
         O, A = self._sizes  # noqa: E741, N806
         observations = self._rng.standard_normal((EPISODE + 1, O), np.float32)
         actions = self._rng.uniform(-1, 1, (EPISODE, A)).astype(np.float32)
@@ -84,7 +84,7 @@ class Run:
         self._episode += 1
 
     def label(self) -> None:
-        """New labels for every step."""
+        """Apply new labels to every step."""
         first = self._episode - self.memory.steps // EPISODE
         numbers = np.arange(first, self._episode, dtype=np.uint32)
         lengths = np.full(len(numbers), EPISODE, np.uint32)
@@ -108,7 +108,7 @@ class Run:
 def forms(
     sizes: tuple[int, int], device: str, batch: int, width: int
 ) -> dict[str, tuple[DeviceSAC, float]]:
-    """The learners that are compared, and the seconds that making each has taken."""
+    """The learners to compare, and the seconds that it took to make each."""
 
     def make(compiling: bool, **options: Any) -> tuple[DeviceSAC, float]:
         settings = SacSettings(hidden=(width, width), batch=batch, compile=compiling)
@@ -122,7 +122,7 @@ def forms(
 
 
 def seconds(call: Callable[[], object], device: str) -> float:
-    """Until the device has done what a call asks for."""
+    """Seconds until the device has done the work of a call."""
 
     def wait() -> None:
         if device != 'cpu':
@@ -146,11 +146,11 @@ def measure(task: str, arguments: argparse.Namespace) -> tuple[list[dict[str, An
         name: seconds(lambda sac=sac: sac.take(run.memory), device) for name, sac in made.items()
     }
     for sac in made.values():
-        sac.replay(max(1, updates // 10))  # does not count
+        sac.replay(max(1, updates // 10))  # not counted
     for n in range(arguments.rounds):
         run.phase()
         for name, sac in made.items():
-            run.label()  # which steps are labelled is found out once for all who ask
+            run.label()  # the memory finds out only once which steps are labelled
             phase = seconds(lambda sac=sac: sac.take(run.memory), device)
             took = seconds(lambda sac=sac: sac.replay(updates), device)
             rows.append(
@@ -165,15 +165,15 @@ def measure(task: str, arguments: argparse.Namespace) -> tuple[list[dict[str, An
 
 
 def profiled(call: Callable[[], object], device: str, times: int) -> str:
-    """What the device does while something is done so many times: the longest kernels first."""
+    """The kernels of a call that does something so many times, the longest first."""
     activities = [ProfilerActivity.CPU]
     if device != 'cpu':
         activities.append(ProfilerActivity.CUDA)
-    with profile(activities=activities) as found:
+    with profile(activities=activities) as trace:
         whole = seconds(call, device)
     kind = DeviceType.CPU if device == 'cpu' else DeviceType.CUDA
     time_of = 'self_cpu_time_total' if device == 'cpu' else 'self_device_time_total'
-    kernels = [event for event in found.key_averages() if event.device_type == kind]
+    kernels = [event for event in trace.key_averages() if event.device_type == kind]
     kernels.sort(key=lambda event: -getattr(event, time_of))
     busy = sum(getattr(event, time_of) for event in kernels) / times
     calls = sum(event.count for event in kernels) / times
@@ -212,7 +212,7 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def device_facts(device: str) -> dict[str, str]:
-    """What the GPU is."""
+    """The name and versions of the GPU."""
     if device == 'cpu':
         return {'GPU': 'none: the numbers are those of a CPU'}
     return {
@@ -243,7 +243,8 @@ def main() -> None:
         rows += some
         profiles.append(text)
         print('\n'.join(table(some)), flush=True)
-        write(rows, profiles, facts, arguments)  # what is cut off later is not lost
+        # after each, so that a later interruption loses nothing
+        write(rows, profiles, facts, arguments)
 
 
 def write(
@@ -252,7 +253,7 @@ def write(
     facts: dict[str, str],
     arguments: argparse.Namespace,
 ) -> None:
-    """The CSV file of all rounds, the table and what the machine is."""
+    """Write the CSV file of all rounds, the table and the facts of the machine."""
     arguments.out.mkdir(parents=True, exist_ok=True)
     with (arguments.out / 'rounds.csv').open('w', newline='') as file:
         writer = csv.DictWriter(file, list(rows[0]))

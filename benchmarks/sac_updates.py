@@ -5,24 +5,24 @@
 
     .venv/bin/python benchmarks/sac_updates.py --sbx /tmp/sbx-venv/bin/python
 
-Compared, each in a process of its own that does nothing while another works, and that may use as
-many processors as it is to have threads:
-  - compiled: what `sac.compile=true` runs
-  - eager: what `sac.compile=false` runs
-  - plain: the same update by autograd, as a reader would write it (`learners/sac.py`)
+Each of them has a process of its own, which does nothing while another works and may use as many
+processors as it has threads. Compared are:
+  - compiled: the updates of `sac.compile=true`
+  - eager: the updates of `sac.compile=false`
+  - plain: the same update by autograd, in its simplest form (`learners/sac.py`)
   - sb3, sbx: `train()` of Stable-Baselines3 and of SBX (JAX) with the same settings
   - floor: the floating point operations that an update needs, at the rate that products of
-    256x256 matrices reach here. Counted are the products of the algorithm and nothing else: no
-    gradients of the critics' weights in the actor's step, none of inputs that nobody asks for.
+    256x256 matrices reach here. It counts only the products of the algorithm: no gradients of the
+    critics' weights in the actor's step, and no unused gradients of inputs.
 
 Every process holds 100 000 random steps of the sizes of Ant (27 or 105 observations, 8 actions) or
-HalfCheetah (17, 6), draws its batches from them, and takes as many updates a round as `--updates`
-says. Rounds go through all of them in turn. A ratio is made of two measurements of one round; the
-table gives the median round, and the lowest and highest in brackets. Compiling is left out of the
-rates and given by itself: `cold` with an empty cache, `warm` with what that left.
+HalfCheetah (17, 6), draws its batches from them, and takes `--updates` updates a round. Rounds go
+through all of them in turn. A ratio is of two measurements of one round; the table gives the
+median round, and the lowest and highest in brackets. The rates leave out compiling, which has its
+own columns: `cold` with an empty cache, `warm` with the cache that this left.
 
-`--clock cpu` counts the time that the processor worked for a process instead of the time on the
-wall: for one thread on a machine that does other things as well.
+`--clock cpu` counts a process's CPU time instead of wall time: for one thread on a machine that
+does other things as well.
 """
 
 import argparse
@@ -54,7 +54,7 @@ PACKAGES = ('torch', 'numpy', 'stable-baselines3', 'sbx-rl', 'jax')
 
 @dataclass(frozen=True)
 class Size:
-    """What is learnt, by networks of which size."""
+    """The task, the size of the networks and the threads."""
 
     task: str
     observation: int
@@ -89,11 +89,11 @@ def sizes() -> Iterator[Size]:
 
 
 # ----------------------------------------------------------------------------------------------
-# workers: each says how long it took to get ready, then how long each round took
+# workers: each prints how long it took to get ready, then how long each round took
 
 
 def ours(form: str, size: Size) -> Callable[[int], None]:
-    """Updates as the learner takes them."""
+    """Updates of the learner."""
     import torch
 
     from codetr_ros.config import SacSettings
@@ -179,7 +179,7 @@ def theirs(package: str, size: Size) -> Callable[[int], None]:
         from stable_baselines3 import SAC
 
     class Still(gymnasium.Env):
-        """An environment of the right sizes; nobody acts in it."""
+        """An environment of the right sizes, which is never stepped."""
 
         observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size.observation,))
         action_space = gymnasium.spaces.Box(-1, 1, (size.action,))
@@ -208,7 +208,7 @@ def theirs(package: str, size: Size) -> Callable[[int], None]:
 
 
 def sgemm(size: Size) -> Callable[[int], None]:
-    """Products of 256x256 matrices, as many operations as the updates have."""
+    """Products of 256x256 matrices, with as many operations as the updates."""
     import torch
 
     torch.set_num_threads(size.threads)
@@ -223,21 +223,21 @@ def sgemm(size: Size) -> Callable[[int], None]:
 
 
 def work(name: str, size: Size) -> None:
-    """Get ready, then do rounds as they are asked for on standard input."""
-    # not all packages keep to the number of threads that they are told
+    """Get ready, then do the rounds requested on standard input."""
+    # not all packages keep to their number of threads
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: size.threads])
     began = time.perf_counter()
     if name == 'floor':
         run = sgemm(size)
     else:
         run = ours(name, size) if name in OURS else theirs(name, size)
-    said: dict[str, Any] = {'ready': time.perf_counter() - began, 'versions': {}}
+    state: dict[str, Any] = {'ready': time.perf_counter() - began, 'versions': {}}
     for package in PACKAGES:
         try:
-            said['versions'][package] = version(package)
+            state['versions'][package] = version(package)
         except PackageNotFoundError:
             continue
-    print(json.dumps(said), flush=True)
+    print(json.dumps(state), flush=True)
     for line in sys.stdin:
         wall, cpu = time.perf_counter(), time.process_time()
         run(int(line))
@@ -250,7 +250,7 @@ def work(name: str, size: Size) -> None:
 
 
 class Worker:
-    """A process that does rounds of updates when it is asked to."""
+    """A process that does rounds of updates on request."""
 
     def __init__(self, name: str, size: Size, python: str, environment: dict[str, str]) -> None:
         command = [python, __file__, '--work', name, '--size', json.dumps(asdict(size))]
@@ -274,13 +274,13 @@ class Worker:
         return answer
 
     def round(self, updates: int) -> dict[str, Any]:
-        """Have it take some updates; the seconds they took."""
+        """Have it take some updates; returns the seconds that they took."""
         assert self.process.stdin is not None
         print(updates, file=self.process.stdin, flush=True)
         return self._answer()
 
     def end(self) -> None:
-        """Let it go."""
+        """End it."""
         assert self.process.stdin is not None
         self.process.stdin.close()
         self.process.wait()
@@ -299,7 +299,7 @@ def measure(size: Size, arguments: argparse.Namespace) -> list[dict[str, Any]]:
         if arguments.sbx:
             workers |= {name: Worker(name, size, arguments.sbx, {}) for name in THEIRS}
         for worker in workers.values():
-            worker.round(updates)  # does not count
+            worker.round(updates)  # not counted
         for n in range(arguments.rounds):
             for name, worker in workers.items():
                 times = worker.round(updates)
@@ -341,7 +341,7 @@ HEAD = (
 
 
 def write(rows: list[dict[str, Any]], arguments: argparse.Namespace, load: str) -> None:
-    """The CSV file of all rounds, and the table."""
+    """Write the CSV file of all rounds, and the table."""
     RESULTS.mkdir(parents=True, exist_ok=True)
     with (RESULTS / 'rounds.csv').open('w', newline='') as file:
         writer = csv.DictWriter(file, list(rows[0]))
@@ -374,11 +374,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument('--sbx', default='', help='the Python that has SBX and SB3; none: ours')
+    parser.add_argument('--sbx', default='', help='a Python with SBX and SB3')
     parser.add_argument('--rounds', type=int, default=7)
     parser.add_argument('--updates', type=int, default=200, help='a round of width 256')
     parser.add_argument('--threads', type=int, nargs='+', default=[1, 2])
-    parser.add_argument('--only', default='', help='sizes whose "task observations width" match')
+    parser.add_argument('--only', default='', help='part of "task observations width"')
     parser.add_argument('--clock', choices=['wall', 'cpu'], default='wall')
     parser.add_argument('--work', default='', help=argparse.SUPPRESS)
     parser.add_argument('--size', type=json.loads, help=argparse.SUPPRESS)

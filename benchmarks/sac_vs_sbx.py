@@ -9,9 +9,9 @@
 
     .venv/bin/python benchmarks/sac_vs_sbx.py plot
 
-A run takes minutes and leaves one JSON file in `benchmarks/results/sac_vs_sbx/`; what is there is
-not run again. `plot` draws both learning curves (mean, lowest and highest seed) and writes every
-number to a CSV file.
+A run takes minutes and leaves one JSON file in `benchmarks/results/sac_vs_sbx/`; runs with a file
+there are not made again. `plot` draws both learning curves (mean, lowest and highest seed) and
+writes every number to a CSV file.
 
 Both sides: jaxrl's settings (256x256 networks, batch 256, learning rates 3e-4, tau 0.005, discount
 0.99, initial temperature 1, target entropy -dim/2), 50 000 steps of which the first 10 000 are
@@ -20,14 +20,14 @@ kept in memory, time limits bootstrapped, one thread. Evaluation after the burst
 step from step 10 000 on: 10 deterministic episodes, each from the same start in every evaluation
 of a run.
 
-What differs, on purpose, because it is what SBX does:
+Intended differences, which are SBX's own behaviour:
   - initial weights: LeCun normal (flax's default); ours orthogonal, as jaxrl
   - log standard deviation clipped to [-20, 2]; ours to [-10, 2], as jaxrl
-  - critic loss half of ours (Adam takes the same steps either way, but for its epsilon)
+  - critic loss half of ours (Adam takes the same steps either way, except for its epsilon)
   - temperature loss log(alpha) (entropy - target); ours alpha (entropy - target), as jaxrl (the
     same sign; Adam takes nearly the same steps)
   - step 10 000 itself acts under the initial policy, not at random: `learning_starts` is 9999,
-    for otherwise the first burst would come at step 11 000
+    because otherwise the first burst would come at step 11 000
 
 Which of them makes the difference? `ours_lecun` is ours with flax's initial weights and nothing
 else changed.
@@ -52,7 +52,7 @@ NAMES = {'ours': 'codetr_ros', 'ours_lecun': 'codetr_ros, LeCun weights', 'sbx':
 
 
 def run_sbx(seed: int, steps: int = STEPS, warmup: int = WARMUP) -> dict[str, Any]:
-    """One run of SBX; its packages are needed."""
+    """Do one run of SBX, which needs its packages."""
     flags = '--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1'
     os.environ['XLA_FLAGS'] = f'{os.environ.get("XLA_FLAGS", "")} {flags}'.strip()
     os.environ['JAX_PLATFORMS'] = 'cpu'
@@ -111,7 +111,7 @@ def run_sbx(seed: int, steps: int = STEPS, warmup: int = WARMUP) -> dict[str, An
 def run_ours(
     seed: int, lecun: bool = False, steps: int = STEPS, warmup: int = WARMUP
 ) -> dict[str, Any]:
-    """One in-process run of ours, with its own initial weights or with flax's."""
+    """Do one in-process run of ours, with its own initial weights or with flax's."""
     from codetr_ros import config
     from codetr_ros.cores import in_process
     from codetr_ros.learners import from_labels
@@ -155,7 +155,7 @@ def _with_lecun_weights(sac: type) -> type:
     from codetr_ros.policy.actor import linear_layers
 
     def draw(weight: Any, inputs: int) -> None:
-        std = inputs**-0.5 / 0.87962566103423978  # what the cut takes off the deviation
+        std = inputs**-0.5 / 0.87962566103423978  # the cut shrinks the deviation by this factor
         torch.nn.init.trunc_normal_(weight, 0.0, std, -2 * std, 2 * std)
 
     class LecunSAC(sac):
@@ -198,7 +198,7 @@ def run(implementation: str, seeds: Sequence[int]) -> None:
 
 
 def plot() -> None:
-    """Draw what is there, and write it to a CSV file."""
+    """Draw the curves of all runs there, and write their numbers to a CSV file."""
     import matplotlib
 
     matplotlib.use('Agg')

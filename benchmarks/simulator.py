@@ -1,29 +1,27 @@
-"""How near is a simulated step to what its physics costs, and what does acting cost?
+"""How near is a simulated step to the cost of its physics, and how much does acting cost?
 
     .venv/bin/python benchmarks/simulator.py                    # on an idle machine
 
-Everything is on one thread, and measured in rounds that go through all that is
-compared, in another order each time. A ratio is made of two measurements of one round; the tables
-give the median of the rounds, and the lowest and highest in brackets.
+Everything runs on one thread, in rounds that go through all candidates, in another order each
+time. A ratio is of two measurements of one round; the tables give the median of the rounds, and
+the lowest and highest in brackets.
 
 Steps, for each Gymnasium MuJoCo task that has a name here, under the same random actions from the
-same starts (that all end in the same states is checked; resets are not timed):
-  - ours: `EpisodeRunner.step`, with which simulators and the evaluator step: the scaled action,
-    the physics, observation, reward, termination, finite numbers, segments and scores
+same starts (the script checks that all end in the same states; resets are not timed):
+  - ours: `EpisodeRunner.step` of simulators and the evaluator: the scaled action, the physics,
+    observation, reward, termination, finite numbers, segments and scores
   - floor: the physics and the observation alone, `mj_step` with the task's frame skip and the
-    environment's own `_get_obs`. Humanoid's observation has contact forces, so that its floor has
-    `mj_rnePostConstraint` as well
-  - gymnasium: `step` of what `gymnasium.make` gives
+    environment's own `_get_obs`. Humanoid's observation has contact forces, so its floor includes
+    `mj_rnePostConstraint`
+  - gymnasium: `step` of the environment of `gymnasium.make`
 
 Actions, of a policy of 256x256 with noise, one observation at a time, for the sizes of the same
 tasks:
   - ours: `ActingPolicy.act`
-  - module: the network's forward pass and the same arithmetic, as a reader of PyTorch would write
-    it
+  - module: the network's forward pass and the same arithmetic, in plain PyTorch
   - numpy: the same with numpy's products
 
-`--clock cpu` counts the time that the processor worked for this process instead of the time on
-the wall: for a machine that does other things as well.
+`--clock cpu` counts CPU time instead of wall time: for a machine that does other things as well.
 """
 
 import argparse
@@ -65,9 +63,9 @@ class Player:
 
     Attributes:
         reset: begins an episode from a seed.
-        prepare: what `play` is to be given for actions in [-1, 1].
-        play: takes them; what is timed.
-        observation: the last one.
+        prepare: turns actions in [-1, 1] into the arguments of `play`.
+        play: takes the actions; this is timed.
+        observation: returns the last one.
     """
 
     reset: Callable[[int], Any]
@@ -77,7 +75,7 @@ class Player:
 
 
 def ours(name: str) -> Player:
-    """The loop of this project."""
+    """This project's own steps."""
     environment = tasks.make(name)
     episode = EpisodeRunner(environment, Settings(task=name))
 
@@ -110,7 +108,7 @@ def floor(name: str) -> Player:
 
 
 def plain(name: str) -> Player:
-    """Gymnasium, as people use it."""
+    """Gymnasium in its usual form."""
     env: Any = gymnasium.make(name)
 
     def play(actions: list[F32]) -> None:
@@ -127,12 +125,12 @@ def plain(name: str) -> Player:
 
 
 def scaled(box: Any, actions: F32) -> list[F32]:
-    """Actions in [-1, 1] as an environment with these bounds takes them."""
+    """Actions in [-1, 1], scaled to the bounds of an environment."""
     return list((box.high + box.low) / 2 + (box.high - box.low) / 2 * actions)
 
 
 def episodes(name: str, steps: int) -> Iterator[tuple[int, F32]]:
-    """Seeds and actions of episodes under the random policy, of so many steps together."""
+    """Seeds and actions of episodes under the random policy, with this many steps together."""
     environment = tasks.make(name)
     episode = EpisodeRunner(environment, Settings(task=name))
     seed = 0
@@ -154,7 +152,7 @@ def step_rows(name: str, arguments: argparse.Namespace) -> list[dict[str, Any]]:
     trace = list(episodes(name, arguments.steps))
     prepared = {who: [p.prepare(a) for _, a in trace] for who, p in players.items()}
     rows = []
-    for number in range(-1, arguments.rounds):  # round -1 does not count
+    for number in range(-1, arguments.rounds):  # round -1 is not counted
         seconds = {}
         for who in turned(list(players), number):
             player, spent = players[who], 0.0
@@ -168,7 +166,7 @@ def step_rows(name: str, arguments: argparse.Namespace) -> list[dict[str, Any]]:
             who: np.asarray(player.observation(), np.float32) for who, player in players.items()
         }
         if any((end != ends['ours']).any() for end in ends.values()):
-            raise SystemExit(f'{name}: what is compared does not end in the same state: {ends}')
+            raise SystemExit(f'{name}: the candidates do not end in the same state: {ends}')
         rows += rows_of('step', name, number, arguments.steps, seconds)
     return rows
 
@@ -223,7 +221,7 @@ def action_rows(name: str, arguments: argparse.Namespace) -> list[dict[str, Any]
 
 
 def turned(names: list[str], number: int) -> list[str]:
-    """Names, another one first in each round."""
+    """The names, with another one first in each round."""
     at = number % len(names)
     return names[at:] + names[:at]
 
@@ -231,7 +229,7 @@ def turned(names: list[str], number: int) -> list[str]:
 def rows_of(
     what: str, task: str, number: int, calls: int, seconds: dict[str, float]
 ) -> list[dict[str, Any]]:
-    """The rows of a round; none of the one that does not count."""
+    """The rows of a round; none for the round that is not counted."""
     if number < 0:
         return []
     return [
@@ -247,7 +245,7 @@ TABLES = {
     'step': ('Steps', ('ours', 'floor', 'gymnasium'), ('floor', 'gymnasium')),
     'action': ('Actions, one observation at a time', ('ours', 'module', 'numpy'), ('module',)),
 }
-"""For each kind of row: its title, whose times are shown, and what ours are compared with."""
+"""For each kind of row: its title, the candidates shown, and those that ours are compared with."""
 
 
 def tables(rows: list[dict[str, Any]]) -> list[str]:
@@ -293,13 +291,13 @@ def write(out: Path, rows: list[dict[str, Any]], text: str) -> None:
 
 
 def main() -> int:
-    """The command line; the exit code."""
+    """Run the command line; returns the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument('--rounds', type=int, default=9)
     parser.add_argument('--steps', type=int, default=2000, help='of a task in a round')
-    parser.add_argument('--only', default='', help='tasks whose name has this in it')
+    parser.add_argument('--only', default='', help='tasks whose name contains this')
     parser.add_argument('--clock', choices=list(CLOCKS), default='wall')
     parser.add_argument('--out', type=Path, default=RESULTS)
     arguments = parser.parse_args()
@@ -315,8 +313,8 @@ def main() -> int:
         'rounds': f'{arguments.rounds}, of {arguments.steps} steps and {CALLS} actions',
         'clock': arguments.clock,
     }
-    said = [f'- {name}: {fact}' for name, fact in facts.items()]
-    text = '\n'.join(['# The simulator', '', *tables(rows), *said]) + '\n'
+    circumstances = [f'- {name}: {fact}' for name, fact in facts.items()]
+    text = '\n'.join(['# The simulator', '', *tables(rows), *circumstances]) + '\n'
     print(text, end='')
     write(arguments.out, rows, text)
     return 0

@@ -2,12 +2,12 @@
 
     .venv/bin/python benchmarks/throughput.py
 
-Machines differ, and a shared one differs from minute to minute, so what counts are ratios of
-numbers from the same call. Each round measures every part for some seconds, then makes one whole
-run in process (A) and the same run over topics (B): A B A B A B for three rounds. The table gives
-the lowest, median and highest round.
+Machines differ, and a shared one differs from minute to minute, so only ratios of numbers from the
+same call count. Each round measures every part for some seconds, then makes one whole run in
+process (A) and the same run over topics (B): A B A B A B for three rounds. The table gives the
+lowest, median and highest round.
 
-Parts, each on one thread (`threads` of the settings) and with nothing beside it:
+Parts, each on one thread (`threads` of the settings) and alone on the machine:
   - the environment under random actions, resets included, and its `step` alone
   - SAC updates, batches sampled from the memory, with the preset's networks and with 256x256 and
     batch 256
@@ -17,20 +17,20 @@ The memory of the last three holds random numbers of the task's sizes, episodes 
 so whole segments: short episodes, as at the start of a run, cost the reward model less.
 
 `part of the run` is the time that a part takes for a run's work, divided by the median whole run
-in process: steps, updates and gradient steps as the settings say, every phase labelling all of
-the memory.
+in process. That work is the steps, updates and gradient steps of the settings, with all of the
+memory labelled in every phase.
 
-Whole runs are the command that users have, `codetr train`. Both evaluate (the table says how
-often), record what they always record (over topics a bag with an fsync for each phase, in process
-none) and save checkpoints. Four times are given:
+Whole runs are the users' own command, `codetr train`. Both evaluate (as often as the table
+states), record as always (over topics a bag with an fsync for each phase, in process none) and
+save checkpoints. Four times are given:
   - whole run: `wall_s` of `summary.json`, from settings to summary: includes importing torch, and
     over topics the start of all processes, their discovery and their end
   - start: until the first permission to simulate
   - work: from the first permission to the summary, the whole run without its start
   - loop: from the first permission to the last commit; leaves out the last phase's learning and
     evaluation as well as the end of the processes
-Over topics the evaluator works beside the loop where there is a free core; in process nothing
-works beside anything.
+Over topics the evaluator works beside the loop if there is a free core; in process everything
+takes turns.
 
     .venv/bin/python benchmarks/throughput.py --no-runs
 
@@ -66,7 +66,7 @@ RESULTS = Path(__file__).parent / 'results'
 PACKAGES = ('torch', 'numpy', 'mujoco', 'gymnasium')
 MARKED = Path(__file__).with_name('marked_train.py')
 WORK = ('simulate_seconds', 'fit_seconds', 'label_seconds', 'update_seconds')
-"""What the nodes say about their work: columns of `metrics.csv`, after the node's name."""
+"""The nodes' reports of their work: columns of `metrics.csv`, after the node's name."""
 Rates = dict[str, float]
 COLUMNS = ('what', 'unit', 'rounds', 'min', 'median', 'max', 'part_of_the_run', 'note')
 
@@ -76,7 +76,7 @@ COLUMNS = ('what', 'unit', 'rounds', 'min', 'median', 'max', 'part_of_the_run', 
 
 
 def rate(work: Callable[[], int], seconds: float) -> float:
-    """How much of its work a function does in a second, after one call that does not count."""
+    """The amount of work that a function does in a second, after one call that is not counted."""
     work()
     done, began = 0, time.perf_counter()
     while (spent := time.perf_counter() - began) < seconds:
@@ -85,7 +85,7 @@ def rate(work: Callable[[], int], seconds: float) -> float:
 
 
 class Parts:
-    """What is measured alone.
+    """The parts that are measured alone.
 
     Args:
         settings: the settings of the run whose parts these are.
@@ -136,17 +136,17 @@ class Parts:
         return {'environment': steps / spent, 'step alone': steps / (spent - resetting)}
 
     def update(self, sac: FlatSAC, settings: Settings) -> int:
-        """Some SAC updates; how many."""
+        """Take some SAC updates; returns how many."""
         sac.burst(settings.sac.burst, lambda rows: self.memory.labelled.sample(self.rng, rows))
         return settings.sac.burst
 
     def gradient_step(self) -> int:
-        """One gradient step of the reward model."""
+        """Take a gradient step of the reward model; returns 1."""
         self.method.gradient_step(self.memory, self.rng)
         return 1
 
     def label(self) -> int:
-        """Label some segments; how many steps they have."""
+        """Label some segments; returns how many steps they have."""
         ids = self.memory.segments.ids()[: self.settings.codetr.label_batch]
         batch = self.memory.segments.batch(ids, self.method.context)
         return len(self.method.label(batch)[segment_steps(batch)])
@@ -214,7 +214,7 @@ def filled_memory(settings: Settings, environment: tasks.Environment) -> Traject
 
 
 def per_run(settings: Settings) -> dict[str, float]:
-    """How much of each part's work a whole run does."""
+    """The amount of each part's work in a whole run."""
     fits = settings.phases - settings.warmup_phases
     gradient_steps = settings.codetr.first_gradient_steps + fits * settings.codetr.gradient_steps
     learnt = range(settings.warmup_phases - 1, settings.phases)  # phases with updates and labels
@@ -233,7 +233,7 @@ def per_run(settings: Settings) -> dict[str, float]:
 def whole_run(
     flags: list[str], in_process: bool, environment: Mapping[str, str] | None = None
 ) -> dict[str, float]:
-    """One run by the command that users have, in an environment; its times [s]."""
+    """Do one run by the users' own command, in an environment; returns its times [s]."""
     with tempfile.TemporaryDirectory() as folder:
         out, marks = Path(folder, 'run'), Path(folder, 'marks.json')
         command = ['train', *flags, '--out', str(out)]
@@ -282,7 +282,7 @@ def whole_run(
 
 
 def marks_of_bag(bag: Path) -> tuple[int, list[int]]:
-    """When a bag's first permission was published, and when its commits were recorded [ns]."""
+    """The publish time of a bag's first permission, and the log times of its commits [ns]."""
     from mcap.reader import make_reader
 
     permissions, commits = [], []
@@ -349,7 +349,7 @@ def table(
         add(f'command, {way}', 's', [x['command'] for x in runs], note)
         for name in WORK:
             values = [x[name] for x in runs]
-            add(f'- {name}, {way}', 's', values, 'sum over the run, as its nodes say')
+            add(f'- {name}, {way}', 's', values, 'sum over the run, as reported by its nodes')
     compared = {'wall': 'whole run', 'rest': 'work', 'loop': 'loop', 'command': 'command'}
     for key, what in compared.items():
         ratios = [y[key] / x[key] for x, y in zip(a, b, strict=True)]
@@ -358,7 +358,7 @@ def table(
 
 
 def circumstances(settings: Settings, flags: list[str], load_at_start: str) -> dict[str, str]:
-    """What the numbers depend on."""
+    """The facts on which the numbers depend."""
     evaluations = sum(map(settings.evaluated, range(settings.phases))) + 1
     return {
         **machine.facts(load_at_start, PACKAGES),
@@ -369,7 +369,7 @@ def circumstances(settings: Settings, flags: list[str], load_at_start: str) -> d
 
 
 def number(value: Any) -> str:
-    """A number for people and for the file: four figures, but no digit of a whole number lost."""
+    """A number for tables: four figures, but all digits of a whole number."""
     if not isinstance(value, float):
         return str(value)
     return f'{value:.0f}' if abs(value) >= 1000 else f'{value:.4g}'
@@ -398,7 +398,7 @@ def markdown(rows: list[dict[str, Any]], facts: dict[str, str]) -> str:
 
 
 def main() -> int:
-    """The command line; the exit code."""
+    """Run the command line; returns the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -3,11 +3,11 @@
     .venv/bin/python benchmarks/whole_runs.py                 # on an idle machine, half an hour
     .venv/bin/python benchmarks/whole_runs.py -- --config quick --steps 6000
 
-The run is `codetr train`, over topics, with the flags behind `--`: by default those of preset
+The run is `codetr train`, over topics, with the flags after `--`: by default those of preset
 `cpu`, 100 000 steps of HalfCheetah with CoDeTr and a score every 25 steps. Its stages take turns
 (lock-step), so that their seconds add up:
   - start: processes, imports, compiling, discovery, until the first permission to simulate
-  - simulate, fit, label, update: what the nodes say they spent on it
+  - simulate, fit, label, update: the times that the nodes report
   - else: the rest of the run, such as messages on their way, checkpoints, the last evaluation
 Evaluation works beside the loop, in a process of its own, and competes for the cores.
 
@@ -31,10 +31,10 @@ PACKAGES = ('numpy', 'torch', 'mujoco')
 LIBRARIES = ('codetr_ros', 'sim_node', 'reward_node', 'learner_node')
 
 
-def stages(found: dict[str, float]) -> dict[str, float]:
-    """Seconds of each stage, from what `throughput.whole_run` says."""
-    work = {name.removesuffix('_seconds'): found[name] for name in throughput.WORK}
-    return {'start': found['start'], **work, 'else': found['rest'] - sum(work.values())}
+def stages(times: dict[str, float]) -> dict[str, float]:
+    """Seconds of each stage, from the times of `throughput.whole_run`."""
+    work = {name.removesuffix('_seconds'): times[name] for name in throughput.WORK}
+    return {'start': times['start'], **work, 'else': times['rest'] - sum(work.values())}
 
 
 def environment(checkout: Path) -> dict[str, str]:
@@ -45,12 +45,12 @@ def environment(checkout: Path) -> dict[str, str]:
 
 
 def main() -> int:
-    """The command line; the exit code."""
+    """Run the command line; returns the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument('--out', default='whole_runs', help='name of the results')
-    parser.add_argument('--checkout', type=Path, help='run the program that is checked out there')
+    parser.add_argument('--checkout', type=Path, help='folder of the checkout to run')
     parser.add_argument('flags', nargs='*', default=['--config', 'cpu'], metavar='FLAG')
     arguments = parser.parse_args()
     facts = machine.facts(machine.load(), PACKAGES)
@@ -58,8 +58,8 @@ def main() -> int:
     if arguments.checkout:
         facts['commit of the run'] = machine.commit(arguments.checkout)
         variables = environment(arguments.checkout.absolute())
-    found = throughput.whole_run(arguments.flags, in_process=False, environment=variables)
-    seconds, wall = stages(found), found['wall']
+    times = throughput.whole_run(arguments.flags, in_process=False, environment=variables)
+    seconds, wall = stages(times), times['wall']
     with (RESULTS / f'{arguments.out}.csv').open('w', newline='') as file:
         writer = csv.writer(file)
         writer.writerow(['stage', 'seconds'])

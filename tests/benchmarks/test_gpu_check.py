@@ -70,13 +70,13 @@ def test_what_is_there_is_written_before_the_next_step_begins(gpu_check, tmp_pat
     reads = f'import sys; sys.exit("| first | done |" not in open({str(table)!r}).read())'
     planned = [step(gpu_check, 'first', 'pass'), step(gpu_check, 'second', reads)]
     outcomes = gpu_check.check(planned, 120, {}, tmp_path)
-    assert [outcome.said for outcome in outcomes] == ['done', 'done']
+    assert [outcome.ending for outcome in outcomes] == ['done', 'done']
 
 
 def test_no_step_is_begun_for_which_no_time_is_left(gpu_check, tmp_path):
     late = tmp_path / 'late'
     outcomes = gpu_check.check([step(gpu_check, 'late', writes(late))], 4, {}, tmp_path)
-    assert outcomes[0].said == 'left out: 4 s were left' and not late.exists()
+    assert outcomes[0].ending == 'left out: 4 s were left' and not late.exists()
 
 
 REPORT = """<testsuites><testsuite>
