@@ -37,7 +37,7 @@ Method = Literal[
 
 
 IN_PROCESS_ONLY = {
-    'true': 'is a reference that uses true rewards, which no node may see',
+    'true': 'is a reference that looks at true rewards, which no node may see',
     'ones': 'is a reference that ignores the scores',
     'lirpg': 'learns on-policy, each phase from its own steps alone',
 }
