@@ -23,10 +23,10 @@ def main(argv: list[str] | None = None) -> int:
         from codetr_ros.ros.node import run_node
         from codetr_ros.ros.recording import Recording
     except ModuleNotFoundError as error:
-        # this command is the one of all nodes that an installation without ROS has too
+        # of all commands of nodes, an installation without ROS has only this one
         print(
             f'record: a node needs ROS 2 and the built workspace, but {error.name} cannot be '
-            'imported. `codetr doctor` says what is missing',
+            'imported. `codetr doctor` names what is missing',
             file=sys.stderr,
         )
         return 2
