@@ -180,7 +180,7 @@ def test_the_delay_is_that_of_the_run_or_else_the_longest_segment(tmp_path):
     unknown = index(tmp_path / 'b', data)
     assert unknown.facts() == {'delay': 5, 'task': 'unknown'}
     assert unknown.notes == [
-        'delay = 5, the longest scored segment: no run in the bags says what it was'
+        'delay = 5, the longest scored segment: no bag holds the settings of a run'
     ]
 
     longer = index(tmp_path / 'c', [run(), *steps(9, [0]), *scores((0, 9))])

@@ -107,11 +107,11 @@ def test_only_steps_and_scores_are_needed(a_run, tmp_path, capsys):
     said = quickly(bag, tmp_path / 'out')
 
     assert (said['task'], said['delay']) == ('unknown', 7)
-    assert 'no run in the bags says what it was' in said['notes'][0]
+    assert 'no bag holds the settings of a run' in said['notes'][0]
     assert said['settings']['codetr'] == config.load('quick').codetr.model_dump(mode='json')
     assert said['metrics']['pearson'] is None
     page = (tmp_path / 'out' / 'report.html').read_text()
-    assert 'no run in the bags says' in page
+    assert 'no bag holds the settings of a run' in page
     assert 'hold no true step rewards' in page
 
 

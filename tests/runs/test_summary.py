@@ -460,7 +460,7 @@ def test_what_was_not_heard_is_taken_from_the_bag(tmp_path):
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     train._complete(late, tmp_path, progress, Interrupts())
     assert told(late) == told(heard)
-    assert 'what was heard' in stream.getvalue()
+    assert 'what was received' in stream.getvalue()
 
 
 def test_ctrl_c_ends_the_reading_of_the_bag_and_the_summary_is_written_all_the_same(tmp_path):

@@ -287,7 +287,7 @@ def _complete(summary: Summary, folder: Path, progress: Progress, interrupts: In
                     return
                 summary.receive(entry.record)
     except BagError as error:
-        progress.log(f'the summary lacks the rest of the bag: {error}')
+        progress.log(f'the summary holds what was received, and the bag up to a fault: {error}')
     except RecoveryError as error:
         progress.log(f'reward recovery is incomplete: {error}')
 

@@ -256,7 +256,9 @@ class Index:
         known = max((settings.delay for settings in self.settings), default=0)
         delay = max(known, self.longest)
         if delay != known:
-            why = f'a run in the bags has {known}' if known else 'no run in the bags has a delay'
+            why = (
+                f'a run in the bags has {known}' if known else 'no bag holds the settings of a run'
+            )
             self.notes.append(f'delay = {delay}, the longest scored segment: {why}')
         tasks = [*self.tasks, *(settings.task for settings in self.settings), 'unknown']
         return {'delay': delay, 'task': tasks[0]}
