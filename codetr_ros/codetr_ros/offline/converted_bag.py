@@ -38,7 +38,7 @@ def convert(bag: Bag, rules: Mapping, folder: Path) -> Conversion:
         _write(_records(bag, rules, converter), rules.source, new)
         if not converter.conversion.steps:
             lost = ', '.join(f'{n} {what}' for what, n in converter.conversion.dropped.items())
-            raise FitError(f'{bag.path}: not one step could be converter: {lost or "no command"}')
+            raise FitError(f'{bag.path}: not one step could be made: {lost or "no command"}')
     return converter.conversion
 
 
