@@ -233,6 +233,14 @@ def test_the_last_phases_keep_what_a_commit_names_once():
     assert last.get(1) == [(Commit, b'd')]
 
 
+def test_of_two_steps_of_the_same_number_the_first_is_sent_again():
+    last = LastPhases(2)
+    last.hold(transitions(), b'taken')
+    last.hold(transitions(), b'refused later, once the source is announced')
+    last.commit(commit(), b'commit')
+    assert [raw for _, raw in last.get(0)] == [b'taken', b'commit']
+
+
 def test_of_a_node_that_was_killed_and_started_again_only_the_newest_instance_counts():
     peers = Peers('record')
 

@@ -86,7 +86,7 @@ OWN_OF_ROLE: dict[str, dict[str, Own]] = {
         ),
         'frozen': Own(
             False,
-            'true: label with the checkpoint as it is; false: let the model go on learning',
+            'true: label with the checkpoint as it is, without learning; false: go on learning',
             of_core=True,
         ),
     },

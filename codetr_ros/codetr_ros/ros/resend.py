@@ -17,11 +17,15 @@ class LastPhases:
         self._phases = phases
 
     def hold(self, record: Record, raw: bytes) -> None:
-        """Keep the bytes of a record that the core has taken, until a commit names it."""
+        """Keep the bytes of a record that the core has taken, until a commit names it.
+
+        The first of a number stays: steps that arrive before their source is announced are checked
+        later, so that a second one of the same number may be one that the core then refuses.
+        """
         if isinstance(record, Transitions):
-            self._open[Transitions, record.source, record.sequence] = raw
+            self._open.setdefault((Transitions, record.source, record.sequence), raw)
         elif isinstance(record, CompositeReward):
-            self._open[CompositeReward, record.scorer, record.sequence] = raw
+            self._open.setdefault((CompositeReward, record.scorer, record.sequence), raw)
 
     def commit(self, commit: Commit, raw: bytes) -> None:
         """File the records that a commit names under its phase; forget the oldest phase."""
