@@ -94,8 +94,7 @@ def outcome(tmp_path_factory):
     settings = tiny()
     alone = start(write(settings, folder / 'alone'), folder / 'alone', '--in-process')
     with domain(), Nodes(settings, folder / 'run') as nodes, Witness(nodes) as witness:
-        for name in nodes.names:
-            nodes.start(name)
+        nodes.start_before(witness)
         witness.until(lambda: witness.committed(1) and witness.scores)
         nodes.send(signal.SIGSTOP, 'sim')  # it waits for the next policy: no step, no phase
         witness.say(*bad_transitions())

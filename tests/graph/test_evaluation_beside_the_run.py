@@ -16,8 +16,7 @@ def test_an_evaluator_that_stands_still_delays_no_phase_and_makes_up_for_it(tmp_
     settings = tiny()
     last = settings.phases - 1
     with domain(), Nodes(settings, tmp_path / 'run') as nodes, Witness(nodes) as witness:
-        for name in nodes.names:
-            nodes.start(name)
+        nodes.start_before(witness)
         witness.until(lambda: witness.committed(0))
         nodes.send(signal.SIGSTOP, 'evaluate')
         witness.until(lambda: witness.committed(last))  # under a policy that it should evaluate

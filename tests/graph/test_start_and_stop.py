@@ -126,8 +126,7 @@ def stopped(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp('stopped') / 'run'
     settings = tiny(steps=ENDLESS, memory_steps=10_000)
     with domain(), Nodes(settings, folder) as nodes, Witness(nodes) as witness:
-        for name in nodes.names:
-            nodes.start(name)
+        nodes.start_before(witness)
         witness.until(lambda: witness.committed(3))
         made = Stopped(request.param, nodes, 0)
         witness.until(  # discovery: the run may be in phase 3 before a visitor knows all of it

@@ -6,7 +6,7 @@ import json
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from rclpy.signals import SignalHandlerOptions
 from codetr_ros.config import Settings
 from codetr_ros.processes import launcher
 from codetr_ros.records import TOPICS, Commit, CompositeReward, Presence, Record
+from codetr_ros.records.roles import published_by
 from codetr_ros.ros import messages, qos
 from codetr_ros.ros.link import Link
 from codetr_ros.runs import folder as run_folder
@@ -64,12 +65,26 @@ class Nodes:
         self._processes = launcher.Processes(print, start_program=start)
         self.names = tuple(self._commands)
 
+    def role(self, name: str) -> str:
+        """The role of a node."""
+        return self._commands[name].role
+
     def start(self, name: str, *parameters: str) -> None:
         """Start a node, with parameters such as `delay:=9` beside those of `codetr train`."""
         made = self._commands[name]
         more = [word for parameter in parameters for word in ('-p', parameter)]
         command = launcher.Command(name, made.role, (*made.arguments, *more))
         self._processes.start([command], self.folder / run_folder.LOGS, self._environment)
+
+    def start_before(self, witness: 'Witness') -> None:
+        """Start all nodes, the evaluator once the witness misses nothing that the others publish:
+        nobody begins without it, and a short run is over before a visitor has found everybody.
+        """
+        first = [name for name in self.names if name != 'evaluate']
+        for name in first:
+            self.start(name)
+        witness.until(lambda: witness.follows(first))
+        self.start('evaluate')
 
     def send(self, number: signal.Signals, *names: str) -> None:
         """Send a signal to nodes; to all of them if none is named."""
@@ -165,6 +180,20 @@ class Witness:
             for path in sorted((self._nodes.folder / run_folder.LOGS).glob('*.log'))
         )
         raise AssertionError(f'not within {PATIENCE:g} s; codes {self._nodes.codes()}\n{logs}')
+
+    def follows(self, names: Collection[str]) -> bool:
+        """Whether all that these nodes publish, of what is read here, arrives."""
+        roles = {name: self._nodes.role(name) for name in names}
+        topics = [TOPICS[kind] for kind in (Presence, Commit, CompositeReward)]
+
+        def writers(topic: str) -> set[str]:
+            return {
+                f'{NAMESPACE}/{name}'
+                for name, role in roles.items()
+                if topic == TOPICS[Presence] or topic in published_by(role)
+            }
+
+        return not self.link.unmatched(topics, writers, readers=False)
 
     def committed(self, phase: int) -> bool:
         """Whether a phase is committed."""

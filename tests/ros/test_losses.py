@@ -233,6 +233,33 @@ def test_the_last_phases_keep_what_a_commit_names_once():
     assert last.get(1) == [(Commit, b'd')]
 
 
+def test_a_peer_that_has_finished_was_there_so_that_a_short_run_is_not_waited_for_again():
+    settings = tiny()
+    peers = Peers('evaluate')
+    for role, count in settings.roles.items():
+        if role != 'evaluate':
+            assert count == 1
+            assert any(role in missing for missing in peers.absent(settings, 'hash'))
+            finished = presence(role, settings_hash='hash', finished=True)
+            peers.note(finished, 0.0)
+    assert peers.absent(settings, 'hash') == []
+    assert len(peers.absent(settings, 'of another run')) == 4
+
+
+def presence(role, settings_hash, finished):
+    return Presence(
+        run_id='run',
+        role=role,
+        node=f'/r/{role}',
+        instance_id=role,
+        settings_hash=settings_hash,
+        finished=finished,
+        topics=(),
+        published=np.zeros(0, np.uint64),
+        missed=0,
+    )
+
+
 def test_of_two_steps_of_the_same_number_the_first_is_sent_again():
     last = LastPhases(2)
     last.hold(transitions(), b'taken')

@@ -62,7 +62,8 @@ def absent_or_unmatched(
     def names(table: Mapping[str, Sequence[str]]) -> Callable[[str], set[str]]:
         def of(topic: str) -> set[str]:
             wanted = [r for r in table[topic] if r in matched and r in settings.roles]
-            return {peer.presence.node for role in wanted for peer in member.peers.alive(role)}
+            peers = [peer for role in wanted for peer in member.peers.alive(role)]
+            return {peer.presence.node for peer in peers if not peer.presence.finished}
 
         return of
 

@@ -62,16 +62,22 @@ class Peers:
         return [peer for peer in self.newest() if peer.presence.role == role]
 
     def absent(self, settings: Settings, settings_hash: str) -> list[str]:
-        """Roles that lack nodes with the run's settings, and the commands that start them."""
+        """Roles that lack nodes with the run's settings, and the commands that start them.
+
+        A peer that has finished was there: nobody begins before this node is matched too, so a
+        short run may be over before this node has looked around.
+        """
         missing = []
         for role, count in settings.roles.items():
-            there = [p for p in self.alive(role) if not p.presence.finished]
+            there = self.alive(role)
             ready = [p for p in there if p.presence.settings_hash == settings_hash]
             have = len(ready) + (role == self.role)
             if have >= count:
                 continue
             of = f' {have + 1} of {count}' if count > 1 else ''
-            if starting := [p.presence.node for p in there if p not in ready]:
+            if starting := [
+                p.presence.node for p in there if p not in ready and not p.presence.finished
+            ]:
                 missing.append(f'{role}{of} ({", ".join(starting)} is there, but not ready yet)')
             else:
                 start = roles.command(role)
