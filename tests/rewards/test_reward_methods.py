@@ -306,6 +306,14 @@ class TestIrcr(Contract):
     has_unit = False
 
 
+class TestEvidence(Contract):
+    method = 'evidence'
+
+
+class TestEvidenceOfAKindOfScoreThatIsNotKnown(TestEvidence):
+    changes: ClassVar[dict[str, Any]] = {'evidence__link': 'choose'}
+
+
 class Rule(Contract):
     """A method that learns nothing; `expected` says what it should give, in the task's unit."""
 

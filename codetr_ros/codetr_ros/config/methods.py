@@ -171,6 +171,37 @@ class RrdSettings(PerceptronSettings):
     )
 
 
+class EvidenceSettings(Group):
+    """Step rewards by Bayesian regression on scores."""
+
+    link: Literal['known', 'choose'] = Field(
+        'known',
+        description='how step rewards make a score: as `composite` and `beta` state, or as the '
+        'scores themselves let infer',
+    )
+    scores: int = Field(
+        8192,
+        ge=2,
+        le=10**6,
+        description='scores to learn from: all, or the newest half and as many of the older ones; '
+        'each takes some 6 KB',
+    )
+    steps: int = Field(
+        32_768,
+        ge=1,
+        le=10**8,
+        description='steps to learn from where a score is no function of a sum, or is not known '
+        'to be: each takes some 3 KB',
+    )
+    scale_scores: int = Field(
+        300,
+        ge=2,
+        le=10_000,
+        description='scores, drawn from these, by which the scales of features and noise are '
+        'learnt',
+    )
+
+
 class SacSettings(Group):
     """Soft actor-critic as in jaxrl."""
 

@@ -16,6 +16,7 @@ from pydantic import Field, model_validator
 from codetr_ros.config.base import Group, SettingsError, flatten, validate
 from codetr_ros.config.methods import (
     CodetrSettings,
+    EvidenceSettings,
     HcSettings,
     LirpgSettings,
     MlpSettings,
@@ -32,7 +33,18 @@ Composite = Literal[
 
 
 Method = Literal[
-    'codetr', 'none', 'rbt', 'rrd', 'ircr', 'hc', 'lirpg', 'mlp', 'uniform', 'true', 'ones'
+    'codetr',
+    'none',
+    'rbt',
+    'rrd',
+    'ircr',
+    'hc',
+    'lirpg',
+    'mlp',
+    'evidence',
+    'uniform',
+    'true',
+    'ones',
 ]
 
 
@@ -155,6 +167,10 @@ class Settings(Schedule, Group):
     )
     mlp: MlpSettings = Field(
         default_factory=MlpSettings, description='the reward model of single steps'
+    )
+    evidence: EvidenceSettings = Field(
+        default_factory=EvidenceSettings,
+        description='Bayesian regression of scores on features of single steps',
     )
     sac: SacSettings = Field(default_factory=SacSettings, description='the policy learner')
     hc: HcSettings = Field(default_factory=HcSettings, description='the critic of method hc')

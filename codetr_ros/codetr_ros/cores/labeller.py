@@ -108,7 +108,7 @@ class Labeller(Consumer):
         for batch in self._label(phase, memory, method):
             parts += batch
             yield []
-        metrics |= due.metrics(memory, method.version)
+        metrics |= method.metrics() | due.metrics(memory, method.version)
         metrics |= {
             'steps_labelled': sum(len(part.labels) for part in parts),
             'target_scale': method.target_scale,

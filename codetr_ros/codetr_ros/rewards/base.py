@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -138,6 +138,16 @@ class RewardMethod(ABC):
     def step_weights(self, batch: SegmentBatch) -> F32 | None:
         """Weights w (B, L) of the steps in the score; None if the method has none."""
         return None
+
+    def metrics(self) -> dict[str, float]:
+        """What there is to publish about the method after a phase, by name; nothing unless a
+        method has something.
+        """
+        return {}
+
+    def report(self) -> dict[str, Any]:
+        """What a run's summary has of the method, by name; nothing unless it has something."""
+        return {}
 
     def state(self) -> dict[str, torch.Tensor]:
         """Copies of everything needed to go on from here."""

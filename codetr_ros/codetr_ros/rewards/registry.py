@@ -3,6 +3,7 @@
 from codetr_ros.config import Settings
 from codetr_ros.rewards.base import RewardMethod, RewardModelError
 from codetr_ros.rewards.codetr import Codetr
+from codetr_ros.rewards.evidence.method import Evidence
 from codetr_ros.rewards.ircr import Ircr
 from codetr_ros.rewards.mlp import Mlp
 from codetr_ros.rewards.rbt import Rbt
@@ -11,7 +12,7 @@ from codetr_ros.rewards.rrd import Rrd
 
 METHODS: dict[str, type[RewardMethod]] = {
     method.name: method
-    for method in (Codetr, LastStep, Rbt, Rrd, Ircr, Mlp, Uniform, TrueReward, Ones)
+    for method in (Codetr, LastStep, Rbt, Rrd, Ircr, Mlp, Evidence, Uniform, TrueReward, Ones)
 }
 """Reward methods by their name in `settings.method`."""
 

@@ -1,0 +1,261 @@
+"""The method `evidence`: step rewards as the posterior mean of a Bayesian regression on scores.
+
+    f(x) = sum_b phi_b(x) . w_b,  w_b ~ N(0, lam_b I),  x = (s, a, s' - s)
+    r_t = f(x_t) + N(0, v_r),  level(R) = F(r_1, ..., r_m) + N(0, v_0)
+
+It takes no gradient steps: in each phase with new scores `prepare` fits it in closed form, or in
+a few rounds of Gauss-Newton where F is not linear. A label is f(x_t) plus one number for all of a
+segment's steps, such that F(labels) is the level of the score: labels explain each score exactly,
+and where the regression knows nothing they are the even spread.
+
+A close relative is GP-LRR (arXiv 2503.17409), whose leave-one-out likelihood is followed by
+gradients; here the evidence is made large in closed form. The modules of this package state what
+is from our trial of the method and what is decided here.
+"""
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from codetr_ros.config import Settings
+from codetr_ros.memory.batches import SegmentBatch
+from codetr_ros.memory.trajectories import Trajectories
+from codetr_ros.records import F32, F64, I64
+from codetr_ros.rewards.base import RewardMethod, RewardModelError, segment_steps
+from codetr_ros.rewards.evidence import links, saving
+from codetr_ros.rewards.evidence.choice import choose
+from codetr_ros.rewards.evidence.features import PIECE, Features
+from codetr_ros.rewards.evidence.links import SoftMax
+from codetr_ros.rewards.evidence.model import Model, of_steps
+from codetr_ros.rewards.evidence.sample import Sample, Sampler, chosen
+from codetr_ros.rewards.evidence.uncertainty import deviations
+from codetr_ros.seeding import generator
+from codetr_ros.system.states import check_state
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Uncertainty:
+    """How far step rewards may be off, one standard deviation, in the unit of labels.
+
+    Of f and of what a reward has beyond f; that a label also explains its segment's own score is
+    not taken off.
+    """
+
+    steps: F32  # (B, L) of each step's reward, 0 outside of the segments
+    segments: F64  # (B,) of the level of each segment's score, predicted from its steps alone
+
+
+class Evidence(RewardMethod):
+    """Bayesian regression of scores on features of single steps, through a link.
+
+    Everything is computed on the CPU, on the threads that torch may use: with other numbers of
+    these the last bits may differ.
+    """
+
+    name: ClassVar[str] = 'evidence'
+    group: ClassVar[str] = 'evidence'
+    label_batch: int = 64
+
+    def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
+        super().__init__(settings, observation_size, action_size)
+        self._own = settings.evidence
+        self._features = Features(observation_size, action_size, settings.seed)
+        self._sampler = Sampler(self._features)
+        self._model = self._new_model()
+        self._fits = 0
+        self._seen = 0  # digest of the scores of the last fit
+        self._chosen_at = 0  # scores that there were when the link was chosen; 0: never
+        self._probability = 1.0
+        self._margin = 0.0
+
+    def _new_model(self) -> Model:
+        settings = self._settings
+        link = links.make(settings.composite, settings.beta, settings.delay)
+        return Model(link, self._features.blocks)
+
+    @property
+    def version(self) -> int:
+        """Fits so far: phases in which there were other scores than before."""
+        return self._fits
+
+    @property
+    def link(self) -> links.Link:
+        """From step rewards to scores: the known one, or the one chosen last."""
+        return self._model.link
+
+    def prepare(self, memory: Trajectories) -> None:
+        """Fit to the scores that the memory holds, unless they are those of the last fit.
+
+        Raises:
+            RewardModelError: the regression has failed on numbers that are too large.
+        """
+        all_ids = memory.segments.ids()
+        scores = memory.segments.scores(all_ids)
+        seen = _digest(all_ids, scores)
+        if self._fits and seen == self._seen:
+            return
+        choosing = self._own.link == 'choose' and len(all_ids) >= 2 * self._chosen_at
+        steps = choosing or not self._model.link.linear
+        ids = self._ids(memory, all_ids, steps)
+        moments = self._sampler.moments(memory, ids)
+        if not self._fits or self._features.moments.moved(moments):
+            self._features.renew(moments)
+            self._sampler.forget()
+        sample = self._sampler.sample(memory, ids, steps)
+        rng = generator(self._settings.seed, 'evidence', 'scales', self._fits)
+        some = np.sort(rng.permutation(len(ids))[: self._own.scale_scores])
+        try:
+            if choosing:
+                self._choose(sample, some, len(all_ids))
+            else:
+                self._model.measure(scores, memory.segments.lengths(all_ids))
+                self._model.fit(sample, some)
+        except FloatingPointError as error:
+            raise RewardModelError(
+                f'method {self.name!r}: the regression on {len(ids)} scores between '
+                f'{scores.min():g} and {scores.max():g} has failed, {error}. Look for scores '
+                'that are far off the others, or scale the rewards of the task'
+            ) from None
+        self.target_scale = self._model.scale if self._settings.target_scale == 'rms' else 1.0
+        self._seen = seen
+        self._fits += 1
+
+    def _ids(self, memory: Trajectories, ids: I64, steps: bool) -> I64:
+        """Segments to learn from: a bounded number, and of bounded steps if these are kept."""
+        most = self._own.scores
+        if steps:
+            mean = float(memory.segments.lengths(ids).mean())
+            most = min(most, max(2, int(self._own.steps / mean)))
+        return chosen(ids, most, self._settings.seed)
+
+    def _choose(self, sample: Sample, some: I64, scores: int) -> None:
+        choice = choose(sample, some, self._features.blocks)
+        self._model = choice.models[choice.best]
+        self._probability = choice.probabilities[choice.best]
+        self._margin = choice.margin
+        self._chosen_at = scores
+
+    # ------------------------------------------------------------------------------------------
+    # asking
+
+    def label(self, batch: SegmentBatch) -> F32:
+        """Step rewards (B, L) that explain each segment's score, 0 elsewhere.
+
+        Raises:
+            RewardModelError: `prepare` was never called.
+        """
+        self._require_prepared()
+        inside = segment_steps(batch)
+        weights = self._model.posterior.mean
+        parts = [of_steps(self._features(piece), weights) for piece in _steps(batch, inside)]
+        m = batch.lengths - batch.context
+        rewards = self._model.labels(np.concatenate(parts), batch.values, m)
+        labels = np.zeros(inside.shape, np.float32)
+        labels[inside] = rewards * (self._model.scale / self.unit)
+        return labels
+
+    def uncertainty(self, batch: SegmentBatch) -> Uncertainty:
+        """How far the rewards of segments' steps may be off: ask for scores where it is large.
+
+        Raises:
+            RewardModelError: `prepare` was never called.
+        """
+        self._require_prepared()
+        inside = segment_steps(batch)
+        features = [self._features(piece) for piece in _steps(batch, inside)]
+        found = deviations(self._model, features, batch.lengths - batch.context)
+        factor = self._model.scale / self.unit
+        steps = np.zeros(inside.shape, np.float32)
+        steps[inside] = found.steps * factor
+        return Uncertainty(steps, found.segments * factor)
+
+    def metrics(self) -> dict[str, float]:
+        """How well the regression knows the scores, after each phase."""
+        if not self._fits:
+            return {}
+        model = self._model
+        step_noise, score_noise = np.exp(model.theta[-2:]).tolist()
+        factor = model.scale / self.unit
+        known = {
+            'evidence': model.evidence,
+            'left_out_r2': model.left_out_r2,
+            'step_noise_sd': step_noise**0.5 * factor,
+            'score_noise_sd': score_noise**0.5 * factor,
+            'link': float(links.NAMES.index(model.link.name)),
+            'link_probability': self._probability,
+            'link_margin': self._margin,
+        }
+        if isinstance(model.link, SoftMax):
+            known['beta'] = model.link.beta / model.scale
+        return known
+
+    def report(self) -> dict[str, Any]:
+        """The link, how sure it is, and what the scales are, for a run's summary."""
+        if not self._fits:
+            return {}
+        scales = np.exp(self._model.theta).tolist()
+        return {
+            'link': self._model.link.name,
+            'link_chosen': self._own.link == 'choose',
+            **self.metrics(),
+            'block_variances': scales[:-2],
+        }
+
+    # ------------------------------------------------------------------------------------------
+    # saving
+
+    def state(self) -> dict[str, Tensor]:
+        """Features, moments, link, scales and posterior, and what has been seen."""
+        counts = {'version': self._fits, 'seen': self._seen, 'chosen_at': self._chosen_at}
+        numbers = {'link_probability': self._probability, 'link_margin': self._margin}
+        return {
+            **super().state(),
+            **saving.saved(self._model),
+            **{name: torch.tensor(n, dtype=torch.float64) for name, n in numbers.items()},
+            **{name: torch.tensor(n, dtype=torch.int64) for name, n in counts.items()},
+            'waves': self._features.waves.clone(),
+            'phases': self._features.phases.clone(),
+            'input_mean': self._features.mean.clone(),
+            'input_std': self._features.std.clone(),
+        }
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Go on from a `state()`.
+
+        Raises:
+            RewardModelError: it is another method's or task's; nothing has changed then.
+        """
+        settings, features = self._settings, self._features
+        check_state(f'reward method {self.name!r}', self.state(), state, RewardModelError)
+        try:
+            self._model = saving.restored(state, features.blocks, settings.beta, settings.delay)
+        except ValueError as error:
+            raise RewardModelError(f'state of method {self.name!r} refused: {error}') from None
+        super().load_state(state)
+        self._fits, self._seen = int(state['version']), int(state['seen'])
+        self._chosen_at = int(state['chosen_at'])
+        self._probability = float(state['link_probability'])
+        self._margin = float(state['link_margin'])
+        features.waves, features.phases = state['waves'].clone(), state['phases'].clone()
+        features.mean, features.std = state['input_mean'].clone(), state['input_std'].clone()
+        self._sampler.forget()
+
+
+def _digest(ids: I64, scores: F64) -> int:
+    """A number by which other scores are told from these."""
+    digest = hashlib.sha256(ids.tobytes() + scores.tobytes()).digest()
+    return int.from_bytes(digest[:8], 'little', signed=True)
+
+
+def _steps(batch: SegmentBatch, inside: NDArray[np.bool_]) -> Iterator[F32]:
+    """The inputs (N, 2 O + A) of the steps of segments, in pieces."""
+    s, after = batch.observations[:, :-1][inside], batch.observations[:, 1:][inside]
+    inputs = np.concatenate([s, batch.actions[inside], after - s], 1)
+    for i in range(0, len(inputs), PIECE):
+        yield inputs[i : i + PIECE]

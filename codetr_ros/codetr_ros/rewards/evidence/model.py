@@ -1,0 +1,200 @@
+"""A regression of scores on the features of their steps, through a link: fitted, and asked.
+
+From the trial: the noise, the closed form where the link is linear, else Gauss-Newton rounds with
+their number, steps and annealing, the learnt beta, and labels that explain each score. Decided
+here: after a first fit, the scales are learnt in the first round only.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from codetr_ros.records import F64, I64
+from codetr_ros.rewards.evidence import links, scales
+from codetr_ros.rewards.evidence.links import Link, SoftMax
+from codetr_ros.rewards.evidence.regression import Posterior, noise, posterior, prior_variances
+from codetr_ros.rewards.evidence.sample import Sample
+from codetr_ros.rewards.evidence.scales import Evidence, Linear
+
+ROUNDS = (8, 3)
+"""Gauss-Newton rounds of a first fit and of later ones."""
+ITERATIONS = (40, 10)
+"""Of the search for scales: at first, later."""
+HEATS = ((0.1, 3), (0.3, 3))
+"""A soft maximum is annealed at the first fit: its beta by such a factor, for so many rounds."""
+STEPS = (1.0, 0.5, 0.25)
+"""Step lengths of Gauss-Newton, of which the best one is taken."""
+
+
+class Model:
+    """f(x) = sum_b phi_b(x) . w_b with step noise v_r and score noise v_0, given scores.
+
+    Args:
+        link: from step rewards to scores.
+        blocks: of the features.
+    """
+
+    def __init__(self, link: Link, blocks: Sequence[slice]) -> None:
+        self.link = link
+        self.blocks = blocks
+        self.scale = 0.0
+        """The unit of levels: their root mean square at the first fit."""
+        self.theta = scales.first(len(blocks))
+        size = blocks[-1].stop
+        self.posterior = Posterior(
+            torch.zeros(size, dtype=torch.float64), torch.zeros(size, size, dtype=torch.float64)
+        )
+        self.fitted = False
+        self.evidence = 0.0
+        """Logarithm of the marginal likelihood of the scores from which scales are learnt."""
+        self.left_out_r2 = 0.0
+        """Of levels of these scores, each predicted from all others."""
+
+    def measure(self, scores: F64, m: I64) -> None:
+        """Freeze the unit of levels, the first time.
+
+        Args:
+            scores: (S,) of segments.
+            m: (S,) their steps.
+        """
+        if not self.scale:
+            self.scale = links.level_scale(self.link.level(scores, m))
+            self.link.measure(self.scale)
+
+    def fit(self, sample: Sample, some: I64) -> None:
+        """Learn from segments.
+
+        Args:
+            sample: the segments; with the features of steps, unless the link is linear.
+            some: places of those from which the scales are learnt.
+        """
+        self.measure(sample.scores, sample.m)
+        y = self.link.level(sample.scores, sample.m) / self.scale
+        places = torch.tensor(some)
+        if self.link.linear:
+            spread = torch.tensor(1 / sample.m)
+            data = Linear(sample.means, spread, torch.tensor(y))
+            log_evidence, residuals = self._learn_scales(data.part(places), ITERATIONS)
+            self.posterior = posterior(data, self.theta, self.blocks)
+        else:
+            log_evidence, residuals = self._rounds(sample, y, places)
+        self.fitted = True
+        slopes = self.link.log_slope(sample.scores, sample.m)[some]
+        self.evidence = log_evidence + float(slopes.sum()) - len(some) * math.log(self.scale)
+        about = y[some] - y[some].mean()
+        total = float(about @ about)
+        self.left_out_r2 = 1 - float(residuals @ residuals) / total if total > 0 else 0.0
+
+    def _rounds(self, sample: Sample, y: F64, places: Tensor) -> tuple[float, Tensor]:
+        """Gauss-Newton, from where it stands."""
+        link, cold = self.link, not self.fitted
+        result = (0.0, torch.zeros(0))
+        if cold:  # as if the score were a mean, to have somewhere to begin
+            result = self._round(sample, y, places, first=True)
+            self.fitted = True
+        if isinstance(link, SoftMax) and cold:
+            for link.heat, rounds in HEATS:
+                for _ in range(rounds):
+                    self._round(sample, y, places)
+            link.heat = 1.0
+        for number in range(ROUNDS[0] - 1 if cold else ROUNDS[1]):
+            result = self._round(sample, y, places, learn=cold or number == 0)
+        return result
+
+    def _round(
+        self, sample: Sample, y: F64, places: Tensor, first: bool = False, learn: bool = True
+    ) -> tuple[float, Tensor]:
+        """Linearise F at the present f, learn the scales, take the step that fits best."""
+        link, m, starts = self.link, sample.m, sample.starts
+        if first:
+            data = Linear(sample.means, torch.tensor(1 / m), torch.tensor(y))
+            result = self._learn_scales(data.part(places), ITERATIONS[:1])
+            self.posterior = posterior(data, self.theta, self.blocks)
+            return result
+        assert sample.steps is not None, f'link {link.name} asks for the features of steps'
+        f = of_steps(sample.steps, self.posterior.mean)
+        level, slopes = link.forward(f, starts, m)
+        targets = y - level + np.add.reduceat(slopes * f, starts)
+        learnt = isinstance(link, SoftMax) and link.learnt and link.heat == 1.0
+        column = None
+        if learnt:
+            assert isinstance(link, SoftMax)
+            column = link.beta_slope(f, starts, m)
+            targets = targets + column * link.log_ratio
+        data = Linear(
+            _gathered(sample.steps, slopes, m),
+            torch.tensor(np.add.reduceat(slopes * slopes, starts)),
+            torch.tensor(targets),
+            None if column is None else torch.tensor(column),
+        )
+        result = self._learn_scales(data.part(places), ITERATIONS if learn else (0, 0))
+        new = posterior(data, self.theta, self.blocks)
+        noises = noise(self.theta, data.spread).numpy()
+        self._step(sample, y, f, new, noises, learnt)
+        return result
+
+    def _step(
+        self, sample: Sample, y: F64, f: F64, new: Posterior, noises: F64, learnt: bool
+    ) -> None:
+        """Go as far towards the new weights as makes the penalised loss least."""
+        link, size = self.link, self.blocks[-1].stop
+        assert sample.steps is not None
+        now = self.posterior.mean
+        away = new.mean[:size] - now
+        along = of_steps(sample.steps, away)
+        variances = prior_variances(self.theta, self.blocks)
+        ratio = link.log_ratio if isinstance(link, SoftMax) else 0.0
+        turn = float(new.mean[-1]) - ratio if learnt else 0.0
+        losses = []
+        for length in STEPS:
+            if isinstance(link, SoftMax):
+                link.move(ratio + length * turn)
+                loss = link.log_ratio**2
+            else:
+                loss = 0.0
+            off = y - link.forward(f + length * along, sample.starts, sample.m)[0]
+            weights = now + length * away
+            loss += float((off * off / noises).sum()) + float((weights**2 / variances).sum())
+            losses.append(loss)
+        best = STEPS[int(np.argmin(losses))]
+        if isinstance(link, SoftMax):
+            link.move(ratio + best * turn)
+        self.posterior = Posterior(now + best * away, new.covariance[:size, :size])
+
+    def _learn_scales(self, data: Linear, iterations: Sequence[int]) -> tuple[float, Tensor]:
+        """The scales' evidence, and the residuals of scores that were left out."""
+        evidence = Evidence(data, self.blocks)
+        most = iterations[-1] if self.fitted else iterations[0]
+        if most:
+            self.theta, value = scales.learn(evidence, self.theta, most)
+        else:
+            value = -evidence(self.theta)[0]
+        return value, evidence.left_out(self.theta)
+
+    def labels(self, f: F64, scores: F64, m: I64) -> F64:
+        """Step rewards (N,) that explain the scores, in units of `scale`.
+
+        Args:
+            f: (N,) of the segments' steps, one segment after the other.
+            scores: (S,) of the segments.
+            m: (S,) their steps.
+        """
+        level = self.link.level(scores, m) / self.scale
+        return f + np.repeat(self.link.shift(f, level, np.cumsum(m) - m, m), m)
+
+
+def of_steps(steps: Tensor, weights: Tensor) -> F64:
+    """The products phi . w (N,) of steps."""
+    f: F64 = (steps @ weights.float()).double().numpy()
+    return f
+
+
+def _gathered(steps: Tensor, slopes: F64, m: I64) -> Tensor:
+    """sum_t J_t phi_t (S, D) of each segment, float64."""
+    parts = steps.split(m.tolist())
+    factors = torch.tensor(slopes.astype(np.float32)).split(m.tolist())
+    sums = [factor @ part for factor, part in zip(factors, parts, strict=True)]
+    return torch.stack(sums).double()

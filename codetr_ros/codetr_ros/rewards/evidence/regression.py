@@ -1,0 +1,67 @@
+"""The posterior of the weights w of f(x) = sum_b phi_b(x) . w_b, given scores and scales."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from codetr_ros.records import F64
+from codetr_ros.rewards.evidence.scales import JITTER, Linear, cholesky
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Normal distribution of the weights, in units of the level scale."""
+
+    mean: Tensor  # (D,)
+    covariance: Tensor  # (D, D)
+
+    def variances(self, rows: Tensor) -> Tensor:
+        """Of rows . w, for rows (N, D) of float64."""
+        return ((rows @ self.covariance) * rows).sum(1).clamp_min_(0)
+
+
+def prior_variances(theta: F64, blocks: Sequence[slice]) -> Tensor:
+    """Of each weight (D,)."""
+    sizes = [b.stop - b.start for b in blocks]
+    return torch.tensor(np.repeat(np.exp(theta[:-2]), sizes))
+
+
+def noise(theta: F64, spread: Tensor) -> Tensor:
+    """Variance (S,) of each score's level given the weights: v_r sum J_t^2 + v_0 + 1e-8."""
+    return float(np.exp(theta[-2])) * spread + float(np.exp(theta[-1])) + JITTER
+
+
+def posterior(data: Linear, theta: F64, blocks: Sequence[slice]) -> Posterior:
+    """Bayesian linear regression, in the space of scores or of weights, whichever is smaller.
+
+    A weight of `data.known`, if there is one, is the last of D + 1.
+
+        scores:  K = P Lam P' + N,  mean = Lam P' K^-1 z,  covariance = Lam - Lam P' K^-1 P Lam
+        weights: A = I + B' B, B = N^-1/2 P Lam^1/2,  covariance = Lam^1/2 A^-1 Lam^1/2
+    """
+    rows, variances = data.rows, prior_variances(theta, blocks)
+    if data.known is not None:
+        rows = torch.cat([rows, data.known[:, None]], 1)
+        variances = torch.cat([variances, torch.ones(1, dtype=torch.float64)])
+    noises = noise(theta, data.spread)
+    root = variances.sqrt()
+    half = rows * root  # P Lam^1/2
+    if len(rows) <= rows.shape[1]:
+        kernel = half @ half.T
+        kernel.diagonal().add_(noises)
+        factor = cholesky(kernel)
+        part = torch.linalg.solve_triangular(factor, half, upper=False)  # L^-1 P Lam^1/2
+        targets = torch.linalg.solve_triangular(factor, data.targets[:, None], upper=False)[:, 0]
+        mean = root * (part.T @ targets)
+        inner = -(part.T @ part)
+        inner.diagonal().add_(1)
+    else:
+        weighted = half / noises.sqrt()[:, None]
+        inner = weighted.T @ weighted
+        inner.diagonal().add_(1)
+        inner = torch.cholesky_inverse(cholesky(inner))
+        mean = root * (inner @ (weighted.T @ (data.targets / noises.sqrt())))
+    return Posterior(mean, root[:, None] * inner * root)

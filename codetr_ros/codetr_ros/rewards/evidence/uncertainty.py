@@ -1,0 +1,40 @@
+"""How far inferred step rewards may be off: the posterior's own deviations."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from codetr_ros.records import F64, I64
+from codetr_ros.rewards.evidence.model import Model, of_steps
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Deviations:
+    """Standard deviations in units of the level scale."""
+
+    steps: F64  # (N,) of each step's reward: of f, and of what a reward has beyond f
+    segments: F64  # (S,) of the level of each segment's score, predicted from its steps alone
+
+
+def deviations(model: Model, features: list[Tensor], m: I64) -> Deviations:
+    """Standard deviations of steps and segments, F linearised at the present f.
+
+    Args:
+        model: a fitted regression.
+        features: (N, D) of the segments' steps, in pieces.
+        m: (S,) the segments' steps.
+    """
+    step_noise, score_noise = np.exp(model.theta[-2:])
+    steps = [model.posterior.variances(piece.double()).numpy() for piece in features]
+    f = np.concatenate([of_steps(piece, model.posterior.mean) for piece in features])
+    starts = np.cumsum(m) - m
+    slopes = model.link.forward(f, starts, m)[1]
+    parts = zip(
+        torch.tensor(slopes).split(m.tolist()), torch.cat(features).split(m.tolist()), strict=True
+    )
+    rows = torch.stack([weights @ part.double() for weights, part in parts])
+    spread = np.add.reduceat(slopes * slopes, starts)
+    levels = model.posterior.variances(rows).numpy() + step_noise * spread + score_noise
+    return Deviations(np.sqrt(np.concatenate(steps) + step_noise), np.sqrt(levels))
