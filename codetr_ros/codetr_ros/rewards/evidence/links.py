@@ -61,7 +61,8 @@ class Link(ABC):
 
     def shift(self, f: F64, level: F64, starts: I64, m: I64) -> F64:
         """What is added (S,) to all steps of a segment so that they explain its level."""
-        return level - self.forward(f, starts, m)[0]
+        shift: F64 = level - self.forward(f, starts, m)[0]
+        return shift
 
 
 class Mean(Link):
@@ -122,7 +123,8 @@ class SumSquare(Link):
 
     def log_slope(self, scores: F64, m: I64) -> F64:
         """-log(2 sqrt(m |R|))."""
-        return -np.log(2 * np.sqrt(m * _floored(scores)))
+        slopes: F64 = -np.log(2 * np.sqrt(m * _floored(scores)))
+        return slopes
 
     def forward(self, f: F64, starts: I64, m: I64) -> tuple[F64, F64]:
         """The signed root of the mean of |f| f, and |f| / (m max(|F|, 0.05))."""
@@ -190,7 +192,8 @@ class SoftMax(Link):
     def _weights(self, f: F64, starts: I64, m: I64) -> F64:
         up = self.sign * f
         raised = np.exp(self.beta * (up - np.repeat(np.maximum.reduceat(up, starts), m)))
-        return raised / np.repeat(np.add.reduceat(raised, starts), m)
+        weights: F64 = raised / np.repeat(np.add.reduceat(raised, starts), m)
+        return weights
 
     def forward(self, f: F64, starts: I64, m: I64) -> tuple[F64, F64]:
         """The sum of w f, and w (1 + beta (f - F)), which sums to 1 over a segment."""

@@ -194,7 +194,7 @@ def of_steps(steps: Tensor, weights: Tensor) -> F64:
 
 def _gathered(steps: Tensor, slopes: F64, m: I64) -> Tensor:
     """sum_t J_t phi_t (S, D) of each segment, float64."""
-    parts = steps.split(m.tolist())
-    factors = torch.tensor(slopes.astype(np.float32)).split(m.tolist())
+    parts = torch.split(steps, m.tolist())
+    factors = torch.split(torch.tensor(slopes.astype(np.float32)), m.tolist())
     sums = [factor @ part for factor, part in zip(factors, parts, strict=True)]
     return torch.stack(sums).double()

@@ -8,13 +8,15 @@ so that a run that is taken up again goes on to the bit.
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from codetr_ros.memory.trajectories import Trajectories
-from codetr_ros.records import F64, I64
+from codetr_ros.records import F32, F64, I64
 from codetr_ros.rewards.evidence.features import (
     PIECE,
     Features,
@@ -23,6 +25,8 @@ from codetr_ros.rewards.evidence.features import (
     step_inputs,
     sums,
 )
+
+V = TypeVar('V')
 
 GATHERED = 256
 """Segments that are taken out of the memory at a time."""
@@ -40,7 +44,8 @@ class Sample:
     @property
     def starts(self) -> I64:
         """Where in `steps` each segment begins."""
-        return np.cumsum(self.m) - self.m
+        starts: I64 = np.cumsum(self.m) - self.m
+        return starts
 
 
 def chosen(ids: I64, most: int, seed: int) -> I64:
@@ -61,10 +66,11 @@ def chosen(ids: I64, most: int, seed: int) -> I64:
     order = np.lexsort((ids, age))
     newest, older = order[: most // 2], order[most // 2 :]
     kept = older[np.argsort(_scrambled(ids[older], seed), kind='stable')[: most - most // 2]]
-    return ids[np.sort(np.concatenate([newest, kept]))]
+    some: I64 = ids[np.sort(np.concatenate([newest, kept]))]
+    return some
 
 
-def _scrambled(ids: I64, seed: int) -> np.ndarray:
+def _scrambled(ids: I64, seed: int) -> NDArray[np.uint64]:
     """A random number of each id, the same for ever (splitmix64; Steele et al., 2014)."""
     with np.errstate(over='ignore'):
         x = ids.astype(np.uint64) + np.uint64(seed + 1) * np.uint64(0x9E3779B97F4A7C15)
@@ -126,19 +132,17 @@ class Sampler:
         self._means = _kept(self._means, ids, lambda new: self._each(memory, new, self._mean))
         return Sample(torch.stack(list(self._means.values())), scores, m)
 
-    def _rows(self, inputs: np.ndarray) -> Tensor:
+    def _rows(self, inputs: F32) -> Tensor:
         return torch.cat([self._features(piece) for piece in _pieces(inputs)])
 
-    def _mean(self, inputs: np.ndarray) -> Tensor:
+    def _mean(self, inputs: F32) -> Tensor:
         parts = [self._features(piece).sum(0, dtype=torch.float64) for piece in _pieces(inputs)]
         return torch.stack(parts).sum(0) / len(inputs)
 
     @staticmethod
-    def _each(
-        memory: Trajectories, ids: I64, look: Callable[[np.ndarray], object]
-    ) -> list[object]:
+    def _each(memory: Trajectories, ids: I64, look: Callable[[F32], V]) -> list[V]:
         """What there is to see of each segment."""
-        views: list[object] = []
+        views: list[V] = []
         for i in range(0, len(ids), GATHERED):
             batch = memory.segments.batch(ids[i : i + GATHERED])
             for row, m in enumerate(batch.lengths.tolist()):
@@ -147,7 +151,7 @@ class Sampler:
         return views
 
 
-def _kept(before: dict, ids: I64, make: Callable[[I64], list]) -> dict:
+def _kept(before: dict[int, V], ids: I64, make: Callable[[I64], list[V]]) -> dict[int, V]:
     """What is known of some ids, in their order; `make` is asked for those that are new."""
     wanted = ids.tolist()
     new = [number for number in wanted if number not in before]
@@ -155,5 +159,5 @@ def _kept(before: dict, ids: I64, make: Callable[[I64], list]) -> dict:
     return {number: before[number] if number in before else made[number] for number in wanted}
 
 
-def _pieces(inputs: np.ndarray) -> list[np.ndarray]:
+def _pieces(inputs: F32) -> list[F32]:
     return [inputs[i : i + PIECE] for i in range(0, len(inputs), PIECE)]

@@ -62,7 +62,8 @@ def cholesky(matrix: Tensor) -> Tensor:
             f'a matrix of {len(matrix)} rows, diagonal {float(matrix.diagonal().min()):g} to '
             f'{float(matrix.diagonal().max()):g}, has no Cholesky factor'
         )
-    return factor
+    lower: Tensor = factor
+    return lower
 
 
 @dataclass(frozen=True)

@@ -31,10 +31,10 @@ def deviations(model: Model, features: list[Tensor], m: I64) -> Deviations:
     f = np.concatenate([of_steps(piece, model.posterior.mean) for piece in features])
     starts = np.cumsum(m) - m
     slopes = model.link.forward(f, starts, m)[1]
-    parts = zip(
-        torch.tensor(slopes).split(m.tolist()), torch.cat(features).split(m.tolist()), strict=True
+    weights, parts = (
+        torch.split(each, m.tolist()) for each in (torch.tensor(slopes), torch.cat(features))
     )
-    rows = torch.stack([weights @ part.double() for weights, part in parts])
+    rows = torch.stack([w @ part.double() for w, part in zip(weights, parts, strict=True)])
     spread = np.add.reduceat(slopes * slopes, starts)
     levels = model.posterior.variances(rows).numpy() + step_noise * spread + score_noise
     return Deviations(np.sqrt(np.concatenate(steps) + step_noise), np.sqrt(levels))
