@@ -76,7 +76,7 @@ class Model:
         places = torch.tensor(some)
         if self.link.linear:
             spread = torch.tensor(1 / sample.m)
-            data = Linear(sample.means, spread, torch.tensor(y))
+            data = Linear(sample.means(), spread, torch.tensor(y))
             log_evidence, residuals = self._learn_scales(data.part(places), ITERATIONS)
             self.posterior = posterior(data, self.theta, self.blocks)
         else:
@@ -100,22 +100,32 @@ class Model:
                 for _ in range(rounds):
                     self._round(sample, y, places)
             link.heat = 1.0
-        for number in range(ROUNDS[0] - 1 if cold else ROUNDS[1]):
-            result = self._round(sample, y, places, learn=cold or number == 0)
+        rounds = ROUNDS[0] - 1 if cold else ROUNDS[1]
+        for number in range(rounds):
+            last = number == rounds - 1
+            result = self._round(sample, y, places, learn=cold or number == 0, last=last)
         return result
 
     def _round(
-        self, sample: Sample, y: F64, places: Tensor, first: bool = False, learn: bool = True
+        self,
+        sample: Sample,
+        y: F64,
+        places: Tensor,
+        first: bool = False,
+        learn: bool = True,
+        last: bool = False,
     ) -> tuple[float, Tensor]:
-        """Linearise F at the present f, learn the scales, take the step that fits best."""
+        """Linearise F at the present f, learn the scales, take the step that fits best.
+
+        The posterior's covariance is that of the last round.
+        """
         link, m, starts = self.link, sample.m, sample.starts
         if first:
-            data = Linear(sample.means, torch.tensor(1 / m), torch.tensor(y))
+            data = Linear(sample.means(), torch.tensor(1 / m), torch.tensor(y))
             result = self._learn_scales(data.part(places), ITERATIONS[:1])
-            self.posterior = posterior(data, self.theta, self.blocks)
+            self.posterior = posterior(data, self.theta, self.blocks, spread=False)
             return result
-        assert sample.steps is not None, f'link {link.name} asks for the features of steps'
-        f = of_steps(sample.steps, self.posterior.mean)
+        f = of_steps(sample.steps(), self.posterior.mean)
         level, slopes = link.forward(f, starts, m)
         targets = y - level + np.add.reduceat(slopes * f, starts)
         learnt = isinstance(link, SoftMax) and link.learnt and link.heat == 1.0
@@ -125,13 +135,13 @@ class Model:
             column = link.beta_slope(f, starts, m)
             targets = targets + column * link.log_ratio
         data = Linear(
-            _gathered(sample.steps, slopes, m),
+            _gathered(sample.steps(), slopes, m),
             torch.tensor(np.add.reduceat(slopes * slopes, starts)),
             torch.tensor(targets),
             None if column is None else torch.tensor(column),
         )
         result = self._learn_scales(data.part(places), ITERATIONS if learn else (0, 0))
-        new = posterior(data, self.theta, self.blocks)
+        new = posterior(data, self.theta, self.blocks, spread=last)
         noises = noise(self.theta, data.spread).numpy()
         self._step(sample, y, f, new, noises, learnt)
         return result
@@ -141,10 +151,9 @@ class Model:
     ) -> None:
         """Go as far towards the new weights as makes the penalised loss least."""
         link, size = self.link, self.blocks[-1].stop
-        assert sample.steps is not None
         now = self.posterior.mean
         away = new.mean[:size] - now
-        along = of_steps(sample.steps, away)
+        along = of_steps(sample.steps(), away)
         variances = prior_variances(self.theta, self.blocks)
         ratio = link.log_ratio if isinstance(link, SoftMax) else 0.0
         turn = float(new.mean[-1]) - ratio if learnt else 0.0

@@ -34,10 +34,11 @@ def noise(theta: F64, spread: Tensor) -> Tensor:
     return float(np.exp(theta[-2])) * spread + float(np.exp(theta[-1])) + JITTER
 
 
-def posterior(data: Linear, theta: F64, blocks: Sequence[slice]) -> Posterior:
+def posterior(data: Linear, theta: F64, blocks: Sequence[slice], spread: bool = True) -> Posterior:
     """Bayesian linear regression, in the space of scores or of weights, whichever is smaller.
 
-    A weight of `data.known`, if there is one, is the last of D + 1.
+    A weight of `data.known`, if there is one, is the last of D + 1. Without `spread` the
+    covariance is left at 0, which takes half of the time.
 
         scores:  K = P Lam P' + N,  mean = Lam P' K^-1 z,  covariance = Lam - Lam P' K^-1 P Lam
         weights: A = I + B' B, B = N^-1/2 P Lam^1/2,  covariance = Lam^1/2 A^-1 Lam^1/2
@@ -53,15 +54,21 @@ def posterior(data: Linear, theta: F64, blocks: Sequence[slice]) -> Posterior:
         kernel = half @ half.T
         kernel.diagonal().add_(noises)
         factor = cholesky(kernel)
+        solved = torch.cholesky_solve(data.targets[:, None], factor)[:, 0]
+        mean = root * (half.T @ solved)
+        if not spread:
+            return Posterior(mean, torch.zeros(len(root), len(root), dtype=torch.float64))
         part = torch.linalg.solve_triangular(factor, half, upper=False)  # L^-1 P Lam^1/2
-        targets = torch.linalg.solve_triangular(factor, data.targets[:, None], upper=False)[:, 0]
-        mean = root * (part.T @ targets)
         inner = -(part.T @ part)
         inner.diagonal().add_(1)
     else:
         weighted = half / noises.sqrt()[:, None]
         inner = weighted.T @ weighted
         inner.diagonal().add_(1)
-        inner = torch.cholesky_inverse(cholesky(inner))
-        mean = root * (inner @ (weighted.T @ (data.targets / noises.sqrt())))
+        factor = cholesky(inner)
+        targets = weighted.T @ (data.targets / noises.sqrt())
+        mean = root * torch.cholesky_solve(targets[:, None], factor)[:, 0]
+        if not spread:
+            return Posterior(mean, torch.zeros(len(root), len(root), dtype=torch.float64))
+        inner = torch.cholesky_inverse(factor)
     return Posterior(mean, root[:, None] * inner * root)

@@ -36,16 +36,27 @@ GATHERED = 256
 class Sample:
     """Scored segments, S of them, in the order of their ids."""
 
-    means: Tensor  # (S, D) float64: each segment's mean features
     scores: F64  # (S,)
     m: I64  # (S,) steps
-    steps: Tensor | None = None  # (N, D) float32: all steps' features, for links that ask for them
+    rows: Tensor  # features: (S, D) float64, segments' means, or (N, D) float32, of all steps
 
     @property
     def starts(self) -> I64:
-        """Where in `steps` each segment begins."""
+        """Where among the steps each segment begins."""
         starts: I64 = np.cumsum(self.m) - self.m
         return starts
+
+    def steps(self) -> Tensor:
+        """Features (N, D) of all steps, for links that ask for them."""
+        assert self.rows.dtype == torch.float32, 'this sample was made without single steps'
+        return self.rows
+
+    def means(self) -> Tensor:
+        """Mean features (S, D) of each segment, float64."""
+        if self.rows.dtype == torch.float64:
+            return self.rows
+        parts = torch.split(self.rows, self.m.tolist())
+        return torch.stack([part.mean(0, dtype=torch.float64) for part in parts])
 
 
 def chosen(ids: I64, most: int, seed: int) -> I64:
@@ -126,11 +137,9 @@ class Sampler:
         scores, m = memory.segments.scores(ids), memory.segments.lengths(ids)
         if steps:
             self._steps = _kept(self._steps, ids, lambda new: self._each(memory, new, self._rows))
-            parts = list(self._steps.values())
-            means = torch.stack([part.mean(0, dtype=torch.float64) for part in parts])
-            return Sample(means, scores, m, torch.cat(parts))
+            return Sample(scores, m, torch.cat(list(self._steps.values())))
         self._means = _kept(self._means, ids, lambda new: self._each(memory, new, self._mean))
-        return Sample(torch.stack(list(self._means.values())), scores, m)
+        return Sample(scores, m, torch.stack(list(self._means.values())))
 
     def _rows(self, inputs: F32) -> Tensor:
         return torch.cat([self._features(piece) for piece in _pieces(inputs)])
