@@ -23,11 +23,20 @@ def linear(observations: F64, actions: F64) -> F64:
     return 0.5 * observations[..., 0] - observations[..., 1] + 2 * actions[..., 0] + 1
 
 
-def memory(lengths: Sequence[int] = (64,) * 8, delay: int = DELAY, seed: int = 0) -> Trajectories:
-    """Episodes of which only the sums of linear step rewards over segments are told."""
+def memory(
+    lengths: Sequence[int] = (64,) * 8,
+    delay: int = DELAY,
+    seed: int = 0,
+    into: Trajectories | None = None,
+) -> Trajectories:
+    """Episodes of which only the sums of linear step rewards over segments are told.
+
+    They are added to `into`, where it is given.
+    """
     rng = np.random.default_rng(seed)
-    found = Trajectories(O, A, delay, 10_000, 1000)
-    for episode, steps in enumerate(lengths):
+    found = Trajectories(O, A, delay, 10_000, 1000) if into is None else into
+    held = sum(len(source.episodes) for source in found.store.sources)
+    for episode, steps in enumerate(lengths, held):
         chunk = builders.transitions(
             steps=steps,
             sequence=episode,

@@ -201,9 +201,9 @@ class Evidence(RewardMethod):
             return {}
         scales = np.exp(self._model.theta).tolist()
         return {
+            **self.metrics(),
             'link': self._model.link.name,
             'link_chosen': self._own.link == 'choose',
-            **self.metrics(),
             'block_variances': scales[:-2],
         }
 

@@ -59,10 +59,17 @@ class Model:
         Args:
             scores: (S,) of segments.
             m: (S,) their steps.
+
+        Raises:
+            FloatingPointError: they are too large for float64.
         """
         if not self.scale:
-            self.scale = links.level_scale(self.link.level(scores, m))
-            self.link.measure(self.scale)
+            with np.errstate(over='ignore'):
+                scale = links.level_scale(self.link.level(scores, m))
+            if not math.isfinite(scale):
+                raise FloatingPointError(f'the root mean square of their levels is {scale}')
+            self.scale = scale
+            self.link.measure(scale)
 
     def fit(self, sample: Sample, some: I64) -> None:
         """Learn from segments.
@@ -70,6 +77,9 @@ class Model:
         Args:
             sample: the segments; with the features of steps, unless the link is linear.
             some: places of those from which the scales are learnt.
+
+        Raises:
+            FloatingPointError: numbers are too large for float64.
         """
         self.measure(sample.scores, sample.m)
         y = self.link.level(sample.scores, sample.m) / self.scale
