@@ -27,6 +27,8 @@ CASES = [
     (PENDULUM, 'ircr', 'overlap'),
     (REACHER, 'mlp', 'lock-step'),
     (PENDULUM, 'uniform', 'overlap'),
+    (REACHER, 'evidence', 'lock-step'),
+    (PENDULUM, 'evidence', 'overlap'),
 ]
 
 
