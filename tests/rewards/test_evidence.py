@@ -151,6 +151,7 @@ def test_the_level_is_the_constant_reward_that_explains_a_score(name):
     scores = np.array([score(name, np.full(m, c)) for m, c in zip(M, constants, strict=True)])
     made = link(name)
     np.testing.assert_allclose(made.level(scores, M), constants, rtol=1e-12)
+    np.testing.assert_allclose(made.score(constants, M), scores, rtol=1e-12)
     level, slopes = made.forward(np.repeat(constants, M), STARTS, M)
     np.testing.assert_allclose(level, constants, rtol=1e-12)
     np.testing.assert_allclose(np.add.reduceat(slopes, STARTS), 1, rtol=1e-12)

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from codetr_ros.config import Settings
 from codetr_ros.memory.batches import SegmentBatch
 from codetr_ros.memory.trajectories import Trajectories
-from codetr_ros.records import F32
+from codetr_ros.records import F32, F64
 from codetr_ros.system.states import check_state
 
 
@@ -168,6 +168,17 @@ class RewardMethod(ABC):
                 f'method {self.name!r} has no target scale yet: '
                 'call prepare(memory) before it is trained or used'
             )
+
+
+@runtime_checkable
+class Predicts(Protocol):
+    """A reward method that predicts scores from steps alone."""
+
+    context: int
+    """Steps before a segment that it wants in its batches."""
+
+    def predict(self, batch: SegmentBatch) -> F64:
+        """The predicted composite rewards (B,), in the task's unit."""
 
 
 def segment_steps(batch: SegmentBatch) -> NDArray[np.bool_]:

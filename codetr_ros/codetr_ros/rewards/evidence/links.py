@@ -46,6 +46,10 @@ class Link(ABC):
         """The constant step reward (S,) that would explain each score."""
 
     @abstractmethod
+    def score(self, level: F64, m: I64) -> F64:
+        """The score (S,) of segments of such levels: the inverse of `level`."""
+
+    @abstractmethod
     def log_slope(self, scores: F64, m: I64) -> F64:
         """The log |d level / d score| (S,), by which evidences of different links compare."""
 
@@ -75,6 +79,10 @@ class Mean(Link):
         """R."""
         return scores
 
+    def score(self, level: F64, m: I64) -> F64:
+        """The level."""
+        return level
+
     def log_slope(self, scores: F64, m: I64) -> F64:
         """0."""
         return np.zeros(len(scores))
@@ -93,6 +101,10 @@ class Sum(Mean):
         """R / m."""
         return scores / m
 
+    def score(self, level: F64, m: I64) -> F64:
+        """The level times m."""
+        return level * m
+
     def log_slope(self, scores: F64, m: I64) -> F64:
         """-log m."""
         return -np.log(m)
@@ -107,6 +119,10 @@ class SquareSum(Mean):
         """sign(R) sqrt(|R|) / m."""
         return signed_power(scores, 0.5) / m
 
+    def score(self, level: F64, m: I64) -> F64:
+        """|S| S of the sum S."""
+        return signed_power(level * m, 2)
+
     def log_slope(self, scores: F64, m: I64) -> F64:
         """-log(2 m sqrt |R|)."""
         return -np.log(2 * m * np.sqrt(_floored(scores)))
@@ -120,6 +136,10 @@ class SumSquare(Link):
     def level(self, scores: F64, m: I64) -> F64:
         """sign(R) sqrt(|R| / m)."""
         return signed_power(scores / m, 0.5)
+
+    def score(self, level: F64, m: I64) -> F64:
+        """The signed square times m."""
+        return m * signed_power(level, 2)
 
     def log_slope(self, scores: F64, m: I64) -> F64:
         """-log(2 sqrt(m |R|))."""
@@ -185,6 +205,10 @@ class SoftMax(Link):
         """R."""
         return scores
 
+    def score(self, level: F64, m: I64) -> F64:
+        """The level."""
+        return level
+
     def log_slope(self, scores: F64, m: I64) -> F64:
         """0."""
         return np.zeros(len(scores))
@@ -234,6 +258,10 @@ class MaxTimesN(SoftMax):
         """R / n."""
         return scores / self._delay
 
+    def score(self, level: F64, m: I64) -> F64:
+        """The level times n."""
+        return level * self._delay
+
     def log_slope(self, scores: F64, m: I64) -> F64:
         """-log n."""
         return np.full(len(scores), -math.log(self._delay))
@@ -265,6 +293,10 @@ class MaxLogSumExp(SoftMax):
     def level(self, scores: F64, m: I64) -> F64:
         """R - log(m) / beta."""
         return scores - np.log(m) / self._raw_beta
+
+    def score(self, level: F64, m: I64) -> F64:
+        """The level and log(m) / beta."""
+        return level + np.log(m) / self._raw_beta
 
     def forward(self, f: F64, starts: I64, m: I64) -> tuple[F64, F64]:
         """log(mean of exp(beta f)) / beta, and softmax(beta f)."""

@@ -152,13 +152,23 @@ class Evidence(RewardMethod):
         """
         self._require_prepared()
         inside = segment_steps(batch)
-        weights = self._model.posterior.mean
-        parts = [of_steps(self._features(piece), weights) for piece in _steps(batch, inside)]
         m = batch.lengths - batch.context
-        rewards = self._model.labels(np.concatenate(parts), batch.values, m)
+        rewards = self._model.labels(self._f(batch), batch.values, m)
         labels = np.zeros(inside.shape, np.float32)
         labels[inside] = rewards * (self._model.scale / self.unit)
         return labels
+
+    def predict(self, batch: SegmentBatch) -> F64:
+        """The composite rewards (B,) that the steps alone let expect, in the task's unit.
+
+        Raises:
+            RewardModelError: `prepare` was never called.
+        """
+        self._require_prepared()
+        f = self._f(batch)
+        m = batch.lengths - batch.context
+        level = self._model.link.forward(f, np.cumsum(m) - m, m)[0]
+        return self._model.link.score(level * self._model.scale, m)
 
     def uncertainty(self, batch: SegmentBatch) -> Uncertainty:
         """How far the rewards of segments' steps may be off: ask for scores where it is large.
@@ -174,6 +184,12 @@ class Evidence(RewardMethod):
         steps = np.zeros(inside.shape, np.float32)
         steps[inside] = found.steps * factor
         return Uncertainty(steps, found.segments * factor)
+
+    def _f(self, batch: SegmentBatch) -> F64:
+        """The posterior mean (N,) of segments' steps, in units of the level scale."""
+        weights = self._model.posterior.mean
+        pieces = _steps(batch, segment_steps(batch))
+        return np.concatenate([of_steps(self._features(piece), weights) for piece in pieces])
 
     def metrics(self) -> dict[str, float]:
         """How well the regression knows the scores, after each phase."""
