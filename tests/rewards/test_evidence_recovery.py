@@ -94,7 +94,18 @@ def test_where_scores_have_nothing_to_do_with_steps_labels_are_the_even_spread()
     batch = everything(made, data)
     even = (batch.values / batch.lengths)[:, None]
     off = (made.label(batch) - even)[segment_steps(batch)]
-    assert np.sqrt(np.mean(off**2)) < 0.5 * np.abs(even).mean()
+    assert np.sqrt(np.mean(off**2)) < 0.25 * np.sqrt(np.mean(even**2))
+
+
+def test_within_long_segments_credit_goes_by_where_a_step_leads():
+    # sums over them hardly depend on whether s or s' is looked at: the changes cancel
+    data = planted.memory(
+        lambda s, a, after: 2 * after[:, 0] + after[:, 1] - 0.3 * (a * a).sum(1),
+        lambda r: float(r.sum()),
+        delay=100,
+        segments=60,
+    )
+    assert planted.within(fitted(data, delay=100), data) > 0.95
 
 
 def test_a_constant_score_is_spread_evenly():
@@ -133,7 +144,9 @@ def test_the_unit_of_scores_does_not_matter(huge):
 
 @pytest.mark.parametrize('kind', ['sum', 'max'])
 def test_intervals_cover_the_step_rewards_and_held_out_scores_as_often_as_they_state(kind):
-    data, others = told(kind, noise=0.3), told(kind, noise=0.3, seed=1)
+    # F is taken as linear over the noise of steps: with much of it a maximum lies above
+    noise = 0.3 if kind == 'sum' else 0.1
+    data, others = told(kind, noise=noise), told(kind, noise=noise, seed=1)
     made = fitted(data, composite=kind, reward_unit='raw')
     batch = everything(made, others)
     known = made.uncertainty(batch)
@@ -226,7 +239,7 @@ def test_moments_are_renewed_once_the_steps_have_moved_on_and_not_before():
     far = linear_rewards.memory((64,) * 8, seed=2)
     made.prepare(far)
     observations = np.concatenate(
-        [far.segments.batch(far.segments.ids()[i : i + 1]).observations[0, :-1] for i in range(64)]
+        [far.segments.batch(far.segments.ids()[i : i + 1]).observations[0, 1:] for i in range(64)]
     )
     expected = observations.astype(np.float64).mean(0)
     assert np.abs(first[:O].numpy() - expected).max() > 0.3
@@ -248,3 +261,36 @@ def test_a_failure_names_the_scores_and_the_remedy():
     data = planted.memory(planted.progress, lambda r: 1e200 * float(r.sum()), segments=20)
     with pytest.raises(RewardModelError, match='scores between .* Look for scores that are far'):
         fitted(data)
+
+
+@pytest.mark.slow
+def test_none_of_two_hundred_random_fits_fails():
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        kind = str(rng.choice(list(COMPOSITES)))
+        delay, unit = int(rng.integers(1, 40)), 10 ** rng.uniform(-6, 6)
+        steps = rng.normal(size=4) * rng.integers(0, 2, 4)  # some make no difference at all
+
+        def reward(s, a, after, w=steps):
+            return w[0] * s[:, 0] + w[1] * after[:, 1] ** 2 + w[2] * a[:, 0] + w[3]
+
+        def score(r, unit=unit, kind=kind, delay=delay, rng=rng):
+            return composite(kind, unit * r, BETA / unit, delay) * rng.normal(1.0, 0.3)
+
+        data = planted.memory(
+            reward,
+            score,
+            delay=delay,
+            segments=int(rng.integers(1, 60)),
+            seed=seed,
+            noise=float(rng.choice([0.0, 0.5])),
+            irregular=bool(rng.integers(2)),
+        )
+        made = fitted(data, composite=kind, delay=delay, beta=BETA, seed=seed)
+        batch = everything(made, data)
+        known = made.uncertainty(batch)
+        where = f'seed {seed}, {kind} of {delay} steps in units of {unit:g}'
+        assert np.isfinite(made.label(batch)).all(), where
+        assert np.isfinite(known.steps).all() and np.isfinite(known.segments).all(), where
+        made.prepare(linear_rewards.memory((delay * 3,), delay, seed=seed))
+        assert np.isfinite(made.label(batch)).all(), where

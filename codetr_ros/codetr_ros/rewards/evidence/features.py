@@ -1,9 +1,13 @@
-"""What the reward of a step may depend on: fixed features of (s, a, s' - s), in blocks.
+"""What the reward of a step may depend on: fixed features of (s', a, s' - s), in blocks.
 
-From the trial: the inputs, the floors and the cut, the blocks, their scaling and their sizes. Both
-ends of a step are seen, as rewards are functions of both. Decided here: moments are those of the
-steps that are learnt from, and they are renewed only when they have moved by more than `DRIFT`, so
-that what was computed from them can be kept from phase to phase.
+From the trial: the floors and the cut, the blocks, their scaling and their sizes, and that both
+ends of a step are seen, as rewards are functions of both. Decided here:
+
+* The trial had s in the place of s'. The two span the same functions, but scores of long segments
+  cannot tell them apart, as the changes s' - s add up to the last observation less the first. Then
+  the prior decides, and rewards are mostly functions of where a step has led to.
+* Moments are those of the steps that are learnt from, and they are renewed only when they have
+  moved by more than `DRIFT`, so that what was computed from them can be kept from phase to phase.
 """
 
 import math
@@ -18,7 +22,7 @@ from codetr_ros.records import F32, F64
 from codetr_ros.seeding import generator
 
 STATE_FLOOR, ACTION_FLOOR, CHANGE_FLOOR = 1e-2, 1e-2, 1e-3
-"""Least deviations by which the components of s, a and s' - s are divided."""
+"""Least deviations by which the components of s', a and s' - s are divided."""
 CLIP = 10.0
 """Deviations from the mean at which standardised inputs are cut off."""
 DRIFT = 0.1
@@ -39,7 +43,7 @@ FOURIER: tuple[tuple[int, float, int], ...] = (
 
 @dataclass(frozen=True)
 class Moments:
-    """Mean and deviation of each component of (s, a, s' - s)."""
+    """Mean and deviation of each component of (s', a, s' - s)."""
 
     mean: F64  # (2 O + A,)
     std: F64  # (2 O + A,), floored
@@ -75,12 +79,12 @@ def moments(total: F64, observation_size: int, action_size: int) -> Moments:
 
 
 class Features:
-    """Features phi (N, D) of steps, D = 1 + 3 O + 2 A + O + 656 at present, in ten blocks.
+    """Features phi (N, D) of steps, D = 1 + 3 O + 2 A + 656, in ten blocks.
 
-    1; s; a; d = s' - s; squares of s and of a; and random Fourier features sqrt(2/D) cos(W z + b),
-    W ~ N(0, 1/(l^2 n)) of n inputs z (Rahimi and Recht, 2007), whose sums of products are
-    Gaussian kernels of length l sqrt(n). Each block has about unit norm, so that the variance of
-    its weights states how much of a reward it makes up.
+    1; s'; a; d = s' - s; squares of s' and of a; and random Fourier features
+    sqrt(2/count) cos(W z + b), W ~ N(0, 1/(l^2 n)), of n inputs z (Rahimi and Recht, 2007), whose
+    sums of products are Gaussian kernels of length l sqrt(n). Each block has about unit norm, so
+    that the variance of its weights states how much of a reward it makes up.
 
     Args:
         observation_size: O.
@@ -145,14 +149,14 @@ class Features:
 
 
 def step_inputs(observations: F32, actions: F32) -> F32:
-    """(s, a, s' - s) of steps that follow on each other: (m, 2 O + A).
+    """(s', a, s' - s) of steps that follow on each other: (m, 2 O + A).
 
     Args:
         observations: (m + 1, O), the one after the last step included.
         actions: (m, A).
     """
-    s = observations[:-1]
-    return np.concatenate([s, actions, observations[1:] - s], 1)
+    after = observations[1:]
+    return np.concatenate([after, actions, after - observations[:-1]], 1)
 
 
 def _slices(sizes: Sequence[int]) -> list[slice]:

@@ -1,6 +1,6 @@
 """The method `evidence`: step rewards as the posterior mean of a Bayesian regression on scores.
 
-    f(x) = sum_b phi_b(x) . w_b,  w_b ~ N(0, lam_b I),  x = (s, a, s' - s)
+    f(x) = sum_b phi_b(x) . w_b,  w_b ~ N(0, lam_b I),  x = (s', a, s' - s)
     r_t = f(x_t) + N(0, v_r),  level(R) = F(r_1, ..., r_m) + N(0, v_0)
 
 It takes no gradient steps: in each phase with new scores `prepare` fits it in closed form, or in
@@ -272,6 +272,6 @@ def _digest(ids: I64, scores: F64) -> int:
 def _steps(batch: SegmentBatch, inside: NDArray[np.bool_]) -> Iterator[F32]:
     """The inputs (N, 2 O + A) of the steps of segments, in pieces."""
     s, after = batch.observations[:, :-1][inside], batch.observations[:, 1:][inside]
-    inputs = np.concatenate([s, batch.actions[inside], after - s], 1)
+    inputs = np.concatenate([after, batch.actions[inside], after - s], 1)
     for i in range(0, len(inputs), PIECE):
         yield inputs[i : i + PIECE]
