@@ -138,6 +138,7 @@ class Sampler:
         if steps:
             self._steps = _kept(self._steps, ids, lambda new: self._each(memory, new, self._rows))
             return Sample(scores, m, torch.cat(list(self._steps.values())))
+        self._steps = {}  # a hundred times as large: not kept for a link that does without
         self._means = _kept(self._means, ids, lambda new: self._each(memory, new, self._mean))
         return Sample(scores, m, torch.stack(list(self._means.values())))
 
