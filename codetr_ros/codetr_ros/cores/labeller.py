@@ -24,7 +24,7 @@ from codetr_ros.records import (
 )
 from codetr_ros.records.roles import subscribed
 from codetr_ros.rewards import registry, saved
-from codetr_ros.rewards.base import RewardMethod, RewardModelError
+from codetr_ros.rewards.base import ModelFacts, RewardMethod, RewardModelError
 from codetr_ros.runs import checkpoints
 from codetr_ros.runs.reports import CoreReport, StartedFrom
 from codetr_ros.seeding import generator, seed_torch
@@ -261,9 +261,10 @@ class Labeller(Consumer):
 
     def report(self) -> CoreReport:
         """Counts and the digest of the reward model, for the run's summary."""
-        more: dict[str, int | str | StartedFrom] = {}
+        more: dict[str, int | str | StartedFrom | ModelFacts | None] = {}
         if self._method is not None:
             more['gradient_steps'] = self._method.gradient_steps
+            more['reward_model'] = self._method.report() or None
             more['reward_model_sha256'] = checkpoints.digest(self._method.state())
         if self._start is not None:
             more['started_from'] = StartedFrom(

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -14,6 +14,9 @@ from codetr_ros.memory.batches import SegmentBatch
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import F32, F64
 from codetr_ros.system.states import check_state
+
+ModelFacts = dict[str, str | float | list[float]]
+"""What a method states of itself in a run's summary, by name."""
 
 
 class RewardModelError(ValueError):
@@ -145,7 +148,7 @@ class RewardMethod(ABC):
         """
         return {}
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> ModelFacts:
         """What a run's summary has of the method, by name; nothing unless it has something."""
         return {}
 

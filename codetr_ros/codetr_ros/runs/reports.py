@@ -83,6 +83,9 @@ class CoreReport(Facts):
     reward_model_sha256: str | None = Field(
         None, description="digest of the reward model's weights"
     )
+    reward_model: dict[str, str | float | list[float]] | None = Field(
+        None, description='what the reward model states of itself, such as the kind of score'
+    )
     started_from: StartedFrom | None = Field(
         None, description='the reward model that it started from, if not from scratch'
     )

@@ -1,5 +1,7 @@
 """Which kind of score it is, where nobody states it: the one that makes the scores likeliest.
 
+The formulas: docs/methods.md#evidence.
+
 From the trial: the evidence of each link as a probability density of the scores themselves, the
 two temperatures from which the soft maximum's is learnt. Decided here: the minimum and, where
 lengths differ, the mean are candidates too; how sure a choice is.

@@ -1,5 +1,7 @@
 """What the reward of a step may depend on: fixed features of (s', a, s' - s), in blocks.
 
+The formulas: docs/methods.md#evidence.
+
 From the trial: the floors and the cut, the blocks, their scaling and their sizes, and that both
 ends of a step are seen, as rewards are functions of both. Decided here:
 

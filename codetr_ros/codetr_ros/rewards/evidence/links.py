@@ -1,5 +1,7 @@
 """How a segment's score arises from its step rewards: what a regression on scores must know.
 
+The formulas: docs/methods.md#evidence.
+
 A link states two things of a kind of score: the `level` of a score, which is the constant step
 reward that would explain it, and F, the level of any step rewards. From the trial: sum,
 square_sum, sum_square and the soft maximum with their levels, F and J = dF/dr, the floor of

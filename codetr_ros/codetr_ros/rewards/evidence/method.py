@@ -6,7 +6,7 @@
 It takes no gradient steps: in each phase with new scores `prepare` fits it in closed form, or in
 a few rounds of Gauss-Newton where F is not linear. A label is f(x_t) plus one number for all of a
 segment's steps, such that F(labels) is the level of the score: labels explain each score exactly,
-and where the regression knows nothing they are the even spread.
+and where the regression knows nothing they are the even spread: docs/methods.md#evidence.
 
 A close relative is GP-LRR (arXiv 2503.17409), whose leave-one-out likelihood is followed by
 gradients; here the evidence is made large in closed form. The modules of this package state what
@@ -16,7 +16,7 @@ is from our trial of the method and what is decided here.
 import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ from codetr_ros.config import Settings
 from codetr_ros.memory.batches import SegmentBatch
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import F32, F64, I64
-from codetr_ros.rewards.base import RewardMethod, RewardModelError, segment_steps
+from codetr_ros.rewards.base import ModelFacts, RewardMethod, RewardModelError, segment_steps
 from codetr_ros.rewards.evidence import links, saving
 from codetr_ros.rewards.evidence.choice import choose
 from codetr_ros.rewards.evidence.features import PIECE, Features
@@ -211,7 +211,7 @@ class Evidence(RewardMethod):
             known['beta'] = model.link.beta / model.scale
         return known
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> ModelFacts:
         """The link, how sure it is, and what the scales are, for a run's summary."""
         if not self._fits:
             return {}
@@ -219,7 +219,7 @@ class Evidence(RewardMethod):
         return {
             **self.metrics(),
             'link': self._model.link.name,
-            'link_chosen': self._own.link == 'choose',
+            'link_is': 'chosen' if self._own.link == 'choose' else 'known',
             'block_variances': scales[:-2],
         }
 

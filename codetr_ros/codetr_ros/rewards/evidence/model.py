@@ -1,5 +1,7 @@
 """A regression of scores on the features of their steps, through a link: fitted, and asked.
 
+The formulas: docs/methods.md#evidence.
+
 From the trial: the noise, the closed form where the link is linear, else Gauss-Newton rounds with
 their number, steps and annealing, the learnt beta, and labels that explain each score. Decided
 here: after a first fit, the scales are learnt in the first round only.

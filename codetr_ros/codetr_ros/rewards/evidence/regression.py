@@ -1,4 +1,7 @@
-"""The posterior of the weights w of f(x) = sum_b phi_b(x) . w_b, given scores and scales."""
+"""The posterior of the weights w of f(x) = sum_b phi_b(x) . w_b, given scores and scales.
+
+The formulas: docs/methods.md#evidence.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,5 +1,7 @@
 """How much each block of features is worth, and how much noise there is: by the evidence.
 
+The formulas: docs/methods.md#evidence.
+
 The evidence is the marginal likelihood of the scores' levels, the weights integrated out. Its
 maximum under a wide prior gives the scales (MacKay, 1992). From the trial: the prior's width and
 noise, bounds, numbers of iterations and of scores. Decided here: where the blocks' prior is.

@@ -1,4 +1,7 @@
-"""How far inferred step rewards may be off: the posterior's own deviations."""
+"""How far inferred step rewards may be off: the posterior's own deviations.
+
+The formulas: docs/methods.md#evidence.
+"""
 
 from dataclasses import dataclass
 
