@@ -12,7 +12,7 @@ from rosbags.rosbag2 import StoragePlugin
 from codetr_ros import cli, config
 from codetr_ros.records import CompositeReward, RunSpec, TaskSpec, Transitions
 from codetr_ros.rewards import registry
-from codetr_ros.rewards.base import Predicts
+from codetr_ros.rewards.base import Predictor
 from codetr_ros.rewards.learned import Learned
 from codetr_ros.runs import checkpoints
 from helpers.builders import run, score, transitions
@@ -87,7 +87,7 @@ def test_every_method_that_a_node_can_run_can_be_fitted(a_run, tmp_path, method)
 
     kind = registry.METHODS[method]
     learns = issubclass(kind, Learned)
-    assert (said['metrics']['composite_r2'] is not None) == issubclass(kind, Predicts)
+    assert (said['metrics']['composite_r2'] is not None) == issubclass(kind, Predictor)
     assert (said['best'] is not None) == learns
     assert len(said['reward_model_sha256']) == 64
 

@@ -25,7 +25,7 @@ from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.loading import Loaded, load
 from codetr_ros.offline.settings import FitSettings
 from codetr_ros.rewards import registry
-from codetr_ros.rewards.base import Predicts, RewardMethod, RewardModelError
+from codetr_ros.rewards.base import Predictor, RewardMethod, RewardModelError
 from codetr_ros.rewards.learned import Learned
 from codetr_ros.seeding import generator, seed_torch
 
@@ -244,7 +244,7 @@ def _learn(
             return
 
 
-def predictions(method: Predicts, loaded: Loaded) -> np.ndarray:
+def predictions(method: Predictor, loaded: Loaded) -> np.ndarray:
     """Predicted composite rewards of all segments of a memory, in the task's unit."""
     ids = loaded.memory.segments.ids()
     made = [

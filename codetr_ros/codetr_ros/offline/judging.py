@@ -8,7 +8,7 @@ import numpy as np
 from codetr_ros.offline.fitting import BATCH, predictions
 from codetr_ros.offline.loading import Loaded
 from codetr_ros.records import F32, F64, I64
-from codetr_ros.rewards.base import Predicts, RewardMethod
+from codetr_ros.rewards.base import Predictor, RewardMethod
 from codetr_ros.runs.recovery_metrics import r_squared, step_recovery
 
 MEASURES = (
@@ -64,7 +64,7 @@ def judge(method: RewardMethod, loaded: Loaded) -> Judgement:
     true = true_rewards_of(loaded, ids)
     inside = ~np.isnan(labels)
     known = np.asarray((np.isfinite(true) | ~inside).all(1))
-    predicted = predictions(method, loaded) if isinstance(method, Predicts) else None
+    predicted = predictions(method, loaded) if isinstance(method, Predictor) else None
     metrics = {
         'segments': float(len(ids)),
         'composite_r2': r_squared(predicted, values) if predicted is not None else float('nan'),

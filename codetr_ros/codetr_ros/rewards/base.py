@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -173,13 +173,10 @@ class RewardMethod(ABC):
             )
 
 
-@runtime_checkable
-class Predicts(Protocol):
-    """A reward method that predicts scores from steps alone."""
+class Predictor(RewardMethod):
+    """A reward method that predicts scores from steps alone, so that it can be judged by them."""
 
-    context: int
-    """Steps before a segment that it wants in its batches."""
-
+    @abstractmethod
     def predict(self, batch: SegmentBatch) -> F64:
         """The predicted composite rewards (B,), in the task's unit."""
 

@@ -14,7 +14,7 @@ from codetr_ros.config import CodetrSettings, PerceptronSettings, Settings
 from codetr_ros.memory.batches import SegmentBatch
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import F32, F64
-from codetr_ros.rewards.base import RewardMethod, RewardModelError, Schedule, segment_steps
+from codetr_ros.rewards.base import Predictor, RewardModelError, Schedule, segment_steps
 from codetr_ros.seeding import seed_torch
 from codetr_ros.system.devices import usable
 
@@ -31,7 +31,7 @@ A component that hardly moved in the warm-up may later lie a thousand of its dev
 """
 
 
-class Learned(RewardMethod):
+class Learned(Predictor):
     """A method that fits a network to composite rewards by gradient steps.
 
     Inside, composite rewards are in units of the target scale c, the root mean square composite

@@ -28,7 +28,7 @@ _OF_TRAINING = frozenset(
         *('batch', 'learning_rate', 'weight_decay', 'dropout', 'warmup_gradient_steps'),
         *('schedule', 'total_gradient_steps', 'first_gradient_steps', 'gradient_steps'),
         *('initialisation', 'label_batch', 'state_loss_weight', 'loss', 'subsequences'),
-        'subsequence_steps',
+        *('subsequence_steps', 'scores', 'steps', 'scale_scores'),
     ]
 )
 """Settings of a reward model on which neither its weights' shapes nor its labels depend."""

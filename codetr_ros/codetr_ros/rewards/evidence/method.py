@@ -27,7 +27,7 @@ from codetr_ros.config import Settings
 from codetr_ros.memory.batches import SegmentBatch
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import F32, F64, I64
-from codetr_ros.rewards.base import ModelFacts, RewardMethod, RewardModelError, segment_steps
+from codetr_ros.rewards.base import ModelFacts, Predictor, RewardModelError, segment_steps
 from codetr_ros.rewards.evidence import links, saving
 from codetr_ros.rewards.evidence.choice import choose
 from codetr_ros.rewards.evidence.features import PIECE, Features
@@ -51,7 +51,7 @@ class Uncertainty:
     segments: F64  # (B,) of the level of each segment's score, predicted from its steps alone
 
 
-class Evidence(RewardMethod):
+class Evidence(Predictor):
     """Bayesian regression of scores on features of single steps, through a link.
 
     Everything is computed on the CPU, on the threads that torch may use: with other numbers of
