@@ -13,6 +13,7 @@ gradients; here the evidence is made large in closed form. The modules of this p
 is from our trial of the method and what is decided here.
 """
 
+import copy
 import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -70,7 +71,7 @@ class Evidence(Predictor):
         self._model = self._new_model()
         self._fits = 0
         self._seen = 0  # digest of the scores of the last fit
-        self._chosen_at = 0  # scores that there were when the link was chosen; 0: never
+        self._begun_at = 0  # scores that there were when a fit was last begun anew; 0: never
         self._probability = 1.0
         self._margin = 0.0
 
@@ -100,7 +101,8 @@ class Evidence(Predictor):
         seen = _digest(all_ids, scores)
         if self._fits and seen == self._seen:
             return
-        choosing = self._own.link == 'choose' and len(all_ids) >= 2 * self._chosen_at
+        anew = len(all_ids) >= 2 * self._begun_at
+        choosing = anew and self._own.link == 'choose'
         steps = choosing or not self._model.link.linear
         ids = self._ids(memory, all_ids, steps)
         moments = self._sampler.moments(memory, ids)
@@ -112,10 +114,10 @@ class Evidence(Predictor):
         some = np.sort(rng.permutation(len(ids))[: self._own.scale_scores])
         try:
             if choosing:
-                self._choose(sample, some, len(all_ids))
+                self._choose(sample, some)
             else:
                 self._model.measure(scores, memory.segments.lengths(all_ids))
-                self._model.fit(sample, some)
+                self._fit(sample, some, anew)
         except FloatingPointError as error:
             raise RewardModelError(
                 f'method {self.name!r}: the regression on {len(ids)} scores between '
@@ -123,6 +125,8 @@ class Evidence(Predictor):
                 'that are far off the others, or scale the rewards of the task'
             ) from None
         self.target_scale = self._model.scale if self._settings.target_scale == 'rms' else 1.0
+        if anew:
+            self._begun_at = len(all_ids)
         self._seen = seen
         self._fits += 1
 
@@ -134,12 +138,26 @@ class Evidence(Predictor):
             most = min(most, max(2, int(self._own.steps / mean)))
         return chosen(ids, most, self._settings.seed)
 
-    def _choose(self, sample: Sample, some: I64, scores: int) -> None:
+    def _fit(self, sample: Sample, some: I64, anew: bool) -> None:
+        """Go on from the last fit, and where `anew` begin anew beside it: the likelier one stays.
+
+        Where F is not linear, a fit to few scores may lead to a place that later fits never leave.
+        """
+        before = self._model
+        fresh = Model(copy.copy(before.link), before.blocks)
+        again = anew and before.fitted and not before.link.linear
+        before.fit(sample, some)
+        if again:
+            fresh.scale = before.scale
+            fresh.fit(sample, some)
+            if fresh.evidence > before.evidence:
+                self._model = fresh
+
+    def _choose(self, sample: Sample, some: I64) -> None:
         choice = choose(sample, some, self._features.blocks)
         self._model = choice.models[choice.best]
         self._probability = choice.probabilities[choice.best]
         self._margin = choice.margin
-        self._chosen_at = scores
 
     # ------------------------------------------------------------------------------------------
     # asking
@@ -228,7 +246,7 @@ class Evidence(Predictor):
 
     def state(self) -> dict[str, Tensor]:
         """Features, moments, link, scales and posterior, and what has been seen."""
-        counts = {'version': self._fits, 'seen': self._seen, 'chosen_at': self._chosen_at}
+        counts = {'version': self._fits, 'seen': self._seen, 'begun_at': self._begun_at}
         numbers = {'link_probability': self._probability, 'link_margin': self._margin}
         return {
             **super().state(),
@@ -255,7 +273,7 @@ class Evidence(Predictor):
             raise RewardModelError(f'state of method {self.name!r} refused: {error}') from None
         super().load_state(state)
         self._fits, self._seen = int(state['version']), int(state['seen'])
-        self._chosen_at = int(state['chosen_at'])
+        self._begun_at = int(state['begun_at'])
         self._probability = float(state['link_probability'])
         self._margin = float(state['link_margin'])
         features.waves, features.phases = state['waves'].clone(), state['phases'].clone()
