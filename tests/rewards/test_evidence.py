@@ -7,6 +7,7 @@ from scipy.stats import multivariate_normal
 
 from codetr_ros.rewards.evidence import links, scales
 from codetr_ros.rewards.evidence.features import DRIFT, Features, Moments, moments, sums
+from codetr_ros.rewards.evidence.maxima import Minimum, SoftMax
 from codetr_ros.rewards.evidence.regression import noise, posterior
 from codetr_ros.rewards.evidence.sample import chosen
 from codetr_ros.rewards.evidence.scales import JITTER, Evidence, Linear
@@ -190,7 +191,7 @@ def test_the_slope_of_the_level_by_the_score_is_that_of_finite_differences(name)
     np.testing.assert_allclose(np.exp(made.log_slope(scores, M)), slope, rtol=1e-6)
 
 
-@pytest.mark.parametrize('kind', [links.SoftMax, links.Minimum])
+@pytest.mark.parametrize('kind', [SoftMax, Minimum])
 def test_the_slope_by_the_temperature_is_that_of_finite_differences(kind):
     f = np.random.default_rng(5).normal(size=15)
     made = kind(BETA, learnt=True)
@@ -203,7 +204,7 @@ def test_the_slope_by_the_temperature_is_that_of_finite_differences(kind):
 
 
 def test_a_temperature_that_is_known_follows_the_unit_and_one_that_is_learnt_does_not():
-    known, learnt = links.SoftMax(2.0), links.SoftMax(2.0, learnt=True)
+    known, learnt = SoftMax(2.0), SoftMax(2.0, learnt=True)
     known.measure(10.0)
     learnt.measure(10.0)
     assert (known.beta, learnt.beta) == (20.0, 2.0)

@@ -7,7 +7,7 @@ import torch
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.rewards import registry
 from codetr_ros.rewards.base import RewardMethod, RewardModelError, segment_steps
-from codetr_ros.rewards.evidence.links import SoftMax
+from codetr_ros.rewards.evidence.maxima import SoftMax
 from codetr_ros.rewards.evidence.method import Evidence
 from codetr_ros.simulation.composite import COMPOSITES, composite
 from helpers import builders, linear_rewards, planted

@@ -14,15 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from codetr_ros.records import I64
-from codetr_ros.rewards.evidence.links import (
-    Link,
-    Mean,
-    Minimum,
-    SoftMax,
-    SquareSum,
-    Sum,
-    SumSquare,
-)
+from codetr_ros.rewards.evidence.link import Link, Mean, SquareSum, Sum, SumSquare
+from codetr_ros.rewards.evidence.maxima import Minimum, SoftMax
 from codetr_ros.rewards.evidence.model import Model
 from codetr_ros.rewards.evidence.sample import Sample
 

@@ -32,7 +32,8 @@ from codetr_ros.rewards.base import ModelFacts, Predictor, RewardModelError, seg
 from codetr_ros.rewards.evidence import links, saving
 from codetr_ros.rewards.evidence.choice import choose
 from codetr_ros.rewards.evidence.features import PIECE, Features
-from codetr_ros.rewards.evidence.links import SoftMax
+from codetr_ros.rewards.evidence.link import Link
+from codetr_ros.rewards.evidence.maxima import SoftMax
 from codetr_ros.rewards.evidence.model import Model, of_steps
 from codetr_ros.rewards.evidence.sample import Sample, Sampler, chosen
 from codetr_ros.rewards.evidence.uncertainty import deviations
@@ -86,7 +87,7 @@ class Evidence(Predictor):
         return self._fits
 
     @property
-    def link(self) -> links.Link:
+    def link(self) -> Link:
         """From step rewards to scores: the known one, or the one chosen last."""
         return self._model.link
 

@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from codetr_ros.records import F64, I64
-from codetr_ros.rewards.evidence import links, scales
-from codetr_ros.rewards.evidence.links import Link, SoftMax
+from codetr_ros.rewards.evidence import scales
+from codetr_ros.rewards.evidence.link import Link, level_scale
+from codetr_ros.rewards.evidence.maxima import SoftMax
 from codetr_ros.rewards.evidence.regression import Posterior, noise, posterior, prior_variances
 from codetr_ros.rewards.evidence.sample import Sample
 from codetr_ros.rewards.evidence.scales import Evidence, Linear
@@ -67,7 +68,7 @@ class Model:
         """
         if not self.scale:
             with np.errstate(over='ignore'):
-                scale = links.level_scale(self.link.level(scores, m))
+                scale = level_scale(self.link.level(scores, m))
             if not math.isfinite(scale):
                 raise FloatingPointError(f'the root mean square of their levels is {scale}')
             self.scale = scale

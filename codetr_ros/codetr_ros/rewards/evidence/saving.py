@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from codetr_ros.rewards.evidence import links
-from codetr_ros.rewards.evidence.links import SoftMax
+from codetr_ros.rewards.evidence.maxima import SoftMax
 from codetr_ros.rewards.evidence.model import Model
 from codetr_ros.rewards.evidence.regression import Posterior
 

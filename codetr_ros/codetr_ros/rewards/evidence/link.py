@@ -1,0 +1,172 @@
+"""How a segment's score arises from its step rewards: what a regression on scores must know.
+
+The formulas: docs/methods.md#evidence.
+
+A link states two things of a kind of score: the `level` of a score, which is the constant step
+reward that would explain it, and F, the level of any step rewards. Levels and step rewards are in
+units of the level scale throughout, except where a score is one. Steps lie one after the other,
+segment by segment; `starts` has where each of S segments begins, m (S,) how many steps it has.
+
+From the trial: levels, F and J = dF/dr of sum, square_sum and sum_square, and the floor of the
+last one's F. Decided here: the mean, and labels of sum_square by bisection.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+import numpy as np
+
+from codetr_ros.records import F64, I64
+
+FLOOR = 0.05
+"""Least level by which sum_square's slopes are divided: F is not smooth at 0."""
+HALVINGS = 60
+"""Bisections by which the labels of sum_square are found: to the last bits of float64."""
+
+
+def signed_power(x: F64, exponent: float) -> F64:
+    """sign(x) |x|^exponent."""
+    return np.sign(x) * np.abs(x) ** exponent
+
+
+class Link(ABC):
+    """A kind of score."""
+
+    name: ClassVar[str]
+    linear: ClassVar[bool] = False
+    """Whether F is linear in the step rewards."""
+
+    @abstractmethod
+    def level(self, scores: F64, m: I64) -> F64:
+        """The constant step reward (S,) that would explain each score."""
+
+    @abstractmethod
+    def score(self, level: F64, m: I64) -> F64:
+        """The score (S,) of segments of such levels: the inverse of `level`."""
+
+    @abstractmethod
+    def log_slope(self, scores: F64, m: I64) -> F64:
+        """The log |d level / d score| (S,), by which evidences of different links compare."""
+
+    @abstractmethod
+    def forward(self, f: F64, starts: I64, m: I64) -> tuple[F64, F64]:
+        """Levels F (S,) of step rewards f (N,), and J = dF/df (N,)."""
+
+    def measure(self, scale: float) -> None:
+        """Take the level scale in, once it is known: temperatures are in units of it from here
+        on.
+        """
+        return
+
+    def shift(self, f: F64, level: F64, starts: I64, m: I64) -> F64:
+        """What is added (S,) to all steps of a segment so that they explain its level."""
+        shift: F64 = level - self.forward(f, starts, m)[0]
+        return shift
+
+
+class Mean(Link):
+    """The mean step reward."""
+
+    name = 'mean'
+    linear = True
+
+    def level(self, scores: F64, m: I64) -> F64:
+        """R."""
+        return scores
+
+    def score(self, level: F64, m: I64) -> F64:
+        """The level."""
+        return level
+
+    def log_slope(self, scores: F64, m: I64) -> F64:
+        """0."""
+        return np.zeros(len(scores))
+
+    def forward(self, f: F64, starts: I64, m: I64) -> tuple[F64, F64]:
+        """The mean, and 1/m."""
+        return np.add.reduceat(f, starts) / m, np.repeat(1 / m, m)
+
+
+class Sum(Mean):
+    """The sum S."""
+
+    name = 'sum'
+
+    def level(self, scores: F64, m: I64) -> F64:
+        """R / m."""
+        return scores / m
+
+    def score(self, level: F64, m: I64) -> F64:
+        """The level times m."""
+        return level * m
+
+    def log_slope(self, scores: F64, m: I64) -> F64:
+        """-log m."""
+        return -np.log(m)
+
+
+class SquareSum(Mean):
+    """|S| S: its signed root is a sum again."""
+
+    name = 'square_sum'
+
+    def level(self, scores: F64, m: I64) -> F64:
+        """sign(R) sqrt(|R|) / m."""
+        return signed_power(scores, 0.5) / m
+
+    def score(self, level: F64, m: I64) -> F64:
+        """|S| S of the sum S."""
+        return signed_power(level * m, 2)
+
+    def log_slope(self, scores: F64, m: I64) -> F64:
+        """-log(2 m sqrt |R|)."""
+        return -np.log(2 * m * np.sqrt(_floored(scores)))
+
+
+class SumSquare(Link):
+    """The sum of |r| r: its level is a signed root mean square."""
+
+    name = 'sum_square'
+
+    def level(self, scores: F64, m: I64) -> F64:
+        """sign(R) sqrt(|R| / m)."""
+        return signed_power(scores / m, 0.5)
+
+    def score(self, level: F64, m: I64) -> F64:
+        """The signed square times m."""
+        return m * signed_power(level, 2)
+
+    def log_slope(self, scores: F64, m: I64) -> F64:
+        """-log(2 sqrt(m |R|))."""
+        slopes: F64 = -np.log(2 * np.sqrt(m * _floored(scores)))
+        return slopes
+
+    def forward(self, f: F64, starts: I64, m: I64) -> tuple[F64, F64]:
+        """The signed root of the mean of |f| f, and |f| / (m max(|F|, 0.05))."""
+        level = signed_power(np.add.reduceat(np.abs(f) * f, starts) / m, 0.5)
+        return level, np.abs(f) / np.repeat(m * np.maximum(np.abs(level), FLOOR), m)
+
+    def shift(self, f: F64, level: F64, starts: I64, m: I64) -> F64:
+        """The root of a function that only rises: between what lifts the largest and what lifts
+        the smallest step to the level.
+        """
+        low = level - np.maximum.reduceat(f, starts)
+        high = level - np.minimum.reduceat(f, starts)
+        due = signed_power(level, 2)
+        for _ in range(HALVINGS):
+            middle = (low + high) / 2
+            shifted = f + np.repeat(middle, m)
+            below = np.add.reduceat(np.abs(shifted) * shifted, starts) / m < due
+            low, high = np.where(below, middle, low), np.where(below, high, middle)
+        return (low + high) / 2
+
+
+def level_scale(levels: F64) -> float:
+    """Root mean square of levels; 1 where that is 0."""
+    scale = math.sqrt(float(np.mean(levels * levels)))
+    return scale if scale > 0 else 1.0
+
+
+def _floored(scores: F64) -> F64:
+    return np.maximum(np.abs(scores), 1e-3 * math.sqrt(float(np.mean(scores * scores))) + 1e-12)
