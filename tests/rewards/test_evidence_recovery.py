@@ -9,6 +9,7 @@ from codetr_ros.rewards import registry
 from codetr_ros.rewards.base import RewardMethod, RewardModelError, segment_steps
 from codetr_ros.rewards.evidence.maxima import SoftMax
 from codetr_ros.rewards.evidence.method import Evidence
+from codetr_ros.rewards.evidence.regression import Posterior
 from codetr_ros.simulation.composite import COMPOSITES, composite
 from helpers import builders, linear_rewards, planted
 from helpers.builders import ACTION as A
@@ -227,6 +228,20 @@ def test_a_run_that_is_taken_up_again_goes_on_to_the_bit(composite):
     assert same(later.state(), through.state())
     one, other = (m.label(everything(m, memory)) for m in (through, later))
     assert one.tobytes() == other.tobytes()
+
+
+def test_a_fit_that_few_scores_led_astray_is_mended_once_there_are_twice_as_many():
+    few, many = told('max', segments=100), told('max', segments=200)
+    made = fitted(few, composite='max')
+    model = made._model
+    astray = torch.randn(len(model.posterior.mean), dtype=torch.float64) * 3
+    model.posterior = Posterior(astray, model.posterior.covariance)
+    model.theta[:] = 12.0  # all of it is noise, and anything goes
+    again = registry.make(made._settings, O, A)
+    again.load_state(made.state())
+    assert planted.within(again, many) < 0.5
+    again.prepare(many)
+    assert planted.within(again, many) > 0.98
 
 
 def test_moments_are_renewed_once_the_steps_have_moved_on_and_not_before():
