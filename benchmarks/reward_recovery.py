@@ -33,9 +33,8 @@ from codetr_ros.cores import in_process
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import CompositeReward, Record, Transitions, TrueRewards
 from codetr_ros.rewards import registry
-from codetr_ros.rewards.base import segment_steps
+from codetr_ros.rewards.base import Predictor, segment_steps
 from codetr_ros.rewards.codetr import Codetr
-from codetr_ros.rewards.learned import Learned
 from codetr_ros.runs.recovery_metrics import r_squared, step_recovery
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.simulation.composite import composite
@@ -63,6 +62,8 @@ VARIANTS: dict[str, dict[str, object]] = {
     'method rrd unbiased': {'method': 'rrd', 'rrd.loss': 'unbiased'},
     'method mlp': {'method': 'mlp'},
     'method ircr': {'method': 'ircr'},
+    'method evidence': {'method': 'evidence'},
+    'method evidence, link chosen': {'method': 'evidence', 'evidence.link': 'choose'},
     'method uniform': {'method': 'uniform'},
 }
 COLUMNS = (
@@ -185,7 +186,7 @@ def measure(
     batch = held_out.segments.batch(held_out.segments.ids(), method.context)
     assert batch.true_rewards is not None
     inside = segment_steps(batch)
-    predicts, attends = isinstance(method, Learned), isinstance(method, Codetr)
+    predicts, attends = isinstance(method, Predictor), isinstance(method, Codetr)
     return {
         'composite_r2': r_squared(method.predict(batch), batch.values) if predicts else math.nan,
         **step_recovery(method.label(batch), batch.true_rewards, inside),

@@ -103,10 +103,11 @@ def test_within_long_segments_credit_goes_by_where_a_step_leads():
     data = planted.memory(
         lambda s, a, after: 2 * after[:, 0] + after[:, 1] - 0.3 * (a * a).sum(1),
         lambda r: float(r.sum()),
-        delay=100,
-        segments=60,
+        delay=250,
+        segments=40,
+        noise=0.3,
     )
-    assert planted.within(fitted(data, delay=100), data) > 0.95
+    assert planted.within(fitted(data, delay=250), data) > 0.97
 
 
 def test_a_constant_score_is_spread_evenly():
@@ -167,7 +168,7 @@ def predicted(made: Evidence, batch) -> np.ndarray:
     from codetr_ros.rewards.evidence.features import step_inputs
 
     rows = [
-        made._features(step_inputs(s, a)).double() @ made._model.posterior.mean
+        made._features(step_inputs(s[:-1], a, s[1:])).double() @ made._model.posterior.mean
         for s, a in zip(batch.observations, batch.actions, strict=True)
     ]
     return np.stack(rows) * made._model.scale

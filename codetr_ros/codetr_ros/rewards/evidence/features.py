@@ -150,15 +150,15 @@ class Features:
         return phi
 
 
-def step_inputs(observations: F32, actions: F32) -> F32:
-    """(s', a, s' - s) of steps that follow on each other: (m, 2 O + A).
+def step_inputs(before: F32, actions: F32, after: F32) -> F32:
+    """What is looked at of steps, (s', a, s' - s): (N, 2 O + A).
 
     Args:
-        observations: (m + 1, O), the one after the last step included.
-        actions: (m, A).
+        before: (N, O) the observations s.
+        actions: (N, A).
+        after: (N, O) the observations s' that they led to.
     """
-    after = observations[1:]
-    return np.concatenate([after, actions, after - observations[:-1]], 1)
+    return np.concatenate([after, actions, after - before], 1)
 
 
 def _slices(sizes: Sequence[int]) -> list[slice]:

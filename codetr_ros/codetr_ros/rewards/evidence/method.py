@@ -31,7 +31,7 @@ from codetr_ros.records import F32, F64, I64
 from codetr_ros.rewards.base import ModelFacts, Predictor, RewardModelError, segment_steps
 from codetr_ros.rewards.evidence import links, saving
 from codetr_ros.rewards.evidence.choice import choose
-from codetr_ros.rewards.evidence.features import PIECE, Features
+from codetr_ros.rewards.evidence.features import PIECE, Features, step_inputs
 from codetr_ros.rewards.evidence.link import Link
 from codetr_ros.rewards.evidence.maxima import SoftMax
 from codetr_ros.rewards.evidence.model import Model, of_steps
@@ -290,7 +290,7 @@ def _digest(ids: I64, scores: F64) -> int:
 
 def _steps(batch: SegmentBatch, inside: NDArray[np.bool_]) -> Iterator[F32]:
     """The inputs (N, 2 O + A) of the steps of segments, in pieces."""
-    s, after = batch.observations[:, :-1][inside], batch.observations[:, 1:][inside]
-    inputs = np.concatenate([after, batch.actions[inside], after - s], 1)
+    before, after = batch.observations[:, :-1][inside], batch.observations[:, 1:][inside]
+    inputs = step_inputs(before, batch.actions[inside], after)
     for i in range(0, len(inputs), PIECE):
         yield inputs[i : i + PIECE]

@@ -156,8 +156,8 @@ class Sampler:
         for i in range(0, len(ids), GATHERED):
             batch = memory.segments.batch(ids[i : i + GATHERED])
             for row, m in enumerate(batch.lengths.tolist()):
-                inputs = step_inputs(batch.observations[row, : m + 1], batch.actions[row, :m])
-                views.append(look(inputs))
+                states = batch.observations[row, : m + 1]
+                views.append(look(step_inputs(states[:-1], batch.actions[row, :m], states[1:])))
         return views
 
 
