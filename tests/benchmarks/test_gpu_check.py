@@ -34,6 +34,7 @@ def has_ended(process: int, seconds: float) -> bool:
         return bool(select.select([handle], [], [], seconds)[0])
 
 
+@pytest.mark.slow
 def test_a_step_that_fails_or_hangs_costs_the_others_nothing(gpu_check, tmp_path):
     """What a step had started ends with it."""
     child = tmp_path / 'child'

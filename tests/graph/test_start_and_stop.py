@@ -23,7 +23,7 @@ from helpers.nodes import NAMESPACE, Nodes, Witness, domain
 from helpers.runs import finish, logs, processes_of, start_installed, until, write
 
 ENDLESS = 10_000_000  # steps
-STOPS = (signal.SIGINT, signal.SIGTERM)
+STOPS = (pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM)
 
 
 def committed_phases(folder: Path) -> list[int]:
@@ -74,6 +74,7 @@ def test_nodes_start_in_any_order_and_finish(tmp_path):
         assert nodes.report(name)['finished']
 
 
+@pytest.mark.slow
 def test_missing_nodes_are_named_with_what_starts_them_and_not_waited_for_in_silence(tmp_path):
     with domain(), Nodes(tiny(), tmp_path / 'run') as nodes:
         nodes.start('learner', 'peer_deadline:=1.0')
