@@ -1,4 +1,3 @@
-import json
 import os
 import re
 import tracemalloc
@@ -11,7 +10,6 @@ from codetr_ros.bags.episodes import SourceChecks
 from codetr_ros.bags.findings import Findings
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.verify import verify
-from codetr_ros.cli import main
 from codetr_ros.records import (
     Commit,
     CompositeReward,
@@ -69,9 +67,13 @@ def bad(array, value=np.nan):
 
 
 RUN = a_run()
+
+
 CHUNK, SCORE, TRUE = (
     [r for r in RUN if isinstance(r, k)][3] for k in (Transitions, CompositeReward, TrueRewards)
 )
+
+
 LABELS = StepRewards(
     run_id='run',
     phase=0,
@@ -84,6 +86,8 @@ LABELS = StepRewards(
     lengths=np.array([5], np.uint32),
     labels=np.ones(5, np.float32),
 )
+
+
 RESULT = EpisodeResult(
     run_id='run',
     source='sim',
@@ -97,6 +101,8 @@ RESULT = EpisodeResult(
     score=float('inf'),
     terminated=False,
 )
+
+
 POLICY = Policy(
     run_id='run',
     phase=1,
@@ -107,6 +113,7 @@ POLICY = Policy(
     network='{}',
     weights=b'no tensors',
 )
+
 
 FAULTS = {
     'a chunk is missing': (
@@ -358,31 +365,6 @@ def test_what_is_whole_ends_before_what_is_missing(tmp_path):
     verdict = verify(ours(tmp_path / 'bag', without(RUN, 5, Transitions)))
     (run,) = verdict.runs.values()
     assert (run.phases, run.whole) == (3, 1)
-
-
-def test_the_command_says_so_by_its_exit_code(tmp_path, capsys):
-    bag = ours(tmp_path / 'bag', RUN)
-    assert main(['bag', 'verify', str(bag)]) == 0
-    said = capsys.readouterr().out
-    assert 'sound' in said and '3 phases committed, all whole' in said
-    assert main(['bag', 'verify', str(bag), '--json']) == 0
-    assert json.loads(capsys.readouterr().out)['sound'] is True
-    (bag / 'metadata.yaml').unlink()
-    assert main(['bag', 'verify', str(bag)]) == 1
-    assert 'codetr bag recover' in capsys.readouterr().out
-    assert main(['bag', 'verify', str(tmp_path / 'none')]) == 2
-
-
-def test_findings_that_are_not_printed_are_counted(tmp_path, capsys):
-    """Of each kind a thousand are named."""
-    records = a_run(phases=300, chunk=1)[1:]  # no segments without the run's settings
-    broken = [replace(r, value=np.nan) if isinstance(r, CompositeReward) else r for r in records]
-    bag = ours(tmp_path / 'bag', broken)
-    count = sum(isinstance(r, CompositeReward) for r in records)
-    assert main(['bag', 'verify', str(bag), '--limit', '5000']) == 1
-    said = capsys.readouterr().out
-    assert said.count('value: ') - said.count('value: 5') == 1000, said[-300:]
-    assert f'value: {count - 1000} more' in said
 
 
 def test_a_row_of_a_compressed_database_is_named_as_one(tmp_path):

@@ -2,140 +2,23 @@ import csv
 import io
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from codetr_ros import config
 from codetr_ros.cli import train
 from codetr_ros.config import Settings
 from codetr_ros.processes.supervise import Interrupts
-from codetr_ros.records import Commit, EpisodeResult, Presence, Record, metrics
+from codetr_ros.records import metrics
 from codetr_ros.runs import facts, report, summary
 from codetr_ros.runs import folder as run_folder
-from codetr_ros.runs.progress import Progress, duration
-from codetr_ros.runs.reports import NodeReport
-from codetr_ros.runs.run_summary import RewardRecovery, RunSummary
+from codetr_ros.runs.progress import Progress
+from codetr_ros.runs.run_summary import RewardRecovery
 from codetr_ros.runs.summary import Summary
 from helpers.bags import ours
 from helpers.builders import step_rewards
-
-SETTINGS = config.load('quick').changed(
-    {'steps': 2500, 'phase_steps': 1000, 'evaluate_every': 1000, 'evaluate_episodes': 2}
-)
-
-
-class Clock:
-    """Time that passes when told to."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
-def commit(phase: int) -> Commit:
-    return Commit(
-        run_id='r',
-        phase=phase,
-        sources=('sim',),
-        transitions=np.array([9]),
-        scorers=('sim',),
-        scores=np.array([3]),
-        dropped=(),
-    )
-
-
-def episode(**changes: Any) -> EpisodeResult:
-    made = EpisodeResult(
-        run_id='r',
-        source='evaluate',
-        purpose='evaluation',
-        step=1000,
-        version=0,
-        episode=0,
-        length=40,
-        true_return=80.0,
-        composite_return=60.0,
-        score=0.5,
-        terminated=True,
-    )
-    return replace(made, **changes)
-
-
-def a_run(settings: Settings = SETTINGS) -> list[Record]:
-    """A run of 2500 steps: three phases, evaluations after 1000, 2000 and 2500 steps."""
-    said: list[Record] = []
-    for i, true in enumerate((10.0, 30.0)):
-        said.append(episode(purpose='random', step=0, version=-1, episode=i, true_return=true))
-    for phase, step in enumerate((1000, 2000, 2500)):
-        said.append(commit(phase))
-        said.append(
-            metrics(
-                'r', 'learner', '/run_r/learner', phase, step, {'critic_loss': 1 / (phase + 1)}
-            )
-        )
-        said.append(metrics('r', 'sim', 'sim', phase, step, {'simulate_seconds': 0.5}))
-        said.append(episode(purpose='training', source='sim', step=step - 1, true_return=50.0))
-        for i, true in enumerate((100.0 * phase, 100.0 * phase + 50)):
-            said.append(
-                episode(step=step, version=phase, episode=i, true_return=true, score=true / 1000)
-            )
-    return said
-
-
-REPORTED: dict[str, dict[str, Any]] = {
-    'sim-sim': {
-        'role': 'sim',
-        'published': {'task': 1, 'transitions': 100},
-        'peak_rss_mb': 80.5,
-        'cpu_s': 2.5,
-        'wall_s': 9.0,
-        'finished': True,
-        'error': None,
-    },
-    'learner-learner': {
-        'role': 'learner',
-        'published': {'run': 1, 'policy': 4},
-        'received': {'transitions': 99},
-        'lost': {'transitions': 1},
-        'duplicated': {'step_rewards': 2},
-        'policy_sha256': 'abc',
-        'updates': 1500,
-        'counters': {'labels of evicted steps': 7},
-    },
-    'reward-reward': {
-        'role': 'reward',
-        'published': {'step_rewards': 3},
-        'received': {'transitions': 100, 'composite_rewards': 60},
-        'lost': {'composite_rewards': 5},
-        'refused': {'composite_rewards': 4},
-        'reward_model_sha256': 'def',
-        'gradient_steps': 240,
-    },
-    'record-record': {'role': 'record', 'recorded': {'transitions': 98}, 'bag': '/runs/x/bag'},
-}
-REPORTS = {
-    key: NodeReport.model_validate({'name': key} | known) for key, known in REPORTED.items()
-}
-
-
-def built(**changes: Any) -> dict[str, Any]:
-    """The summary as it is written."""
-    return run_summary(**changes).model_dump(mode='json')
-
-
-def run_summary(**changes: Any) -> RunSummary:
-    clock = Clock()
-    made = Summary(SETTINGS, 'r', in_process=False, clock=clock)
-    for record in a_run():
-        made.receive(record)
-    clock.now += 50
-    return made.build(REPORTS, **changes)
+from helpers.summaries import SETTINGS, Clock, a_run, built, run_summary
 
 
 def test_a_summary_says_what_was_run_and_what_came_out() -> None:
@@ -333,98 +216,6 @@ def test_a_summary_on_disk_is_what_was_built(tmp_path: Path) -> None:
     said = made.model_dump(mode='json')
     assert json.loads((tmp_path / 'summary.json').read_text()) == said
     assert (tmp_path / 'metrics.csv').read_text() == 'step\n0\n'
-
-
-def presence(node: str, missed: int = 0) -> Presence:
-    published = np.array([1], np.uint64)
-    return Presence(
-        run_id='r',
-        role='sim',
-        node=node,
-        instance_id='i',
-        settings_hash='',
-        finished=False,
-        topics=('task',),
-        published=published,
-        missed=missed,
-    )
-
-
-def test_progress_shows_what_nodes_say_that_they_lack() -> None:
-    clock, stream = Clock(), io.StringIO()
-    progress = Progress(SETTINGS, stream, live=False, clock=clock)
-    progress.receive(presence('/r/sim'))
-    progress.receive(presence('/r/reward', missed=2))
-    progress.receive(presence('/r/learner', missed=3))
-    progress.receive(presence('/r/reward'))  # it has come after all
-    clock.now += 10
-    progress.tick()
-
-    assert progress.lost == 3
-    assert 'lost messages 3' in stream.getvalue()
-
-
-def test_progress_without_a_terminal_says_a_line_for_each_evaluation_and_few_others() -> None:
-    clock, stream = Clock(), io.StringIO()
-    with Progress(SETTINGS, stream, live=False, clock=clock) as progress:
-        for record in a_run():
-            clock.now += 1
-            progress.receive(record)
-            progress.receive(presence('sim'))
-
-    lines = stream.getvalue().splitlines()
-    evaluations = [line for line in lines if line.startswith(('random policy', 'after'))]
-    assert evaluations == [
-        'random policy: true return 20.0 +- 10.0, score 0.500 (2 episodes)',
-        'after 1000 steps: true return 25.0 +- 25.0, score 0.025 (2 episodes)',
-        'after 2000 steps: true return 125.0 +- 25.0, score 0.125 (2 episodes)',
-        'after 2500 steps: true return 225.0 +- 25.0, score 0.225 (2 episodes)',
-    ]
-    assert len(lines) - len(evaluations) <= 4, 'one in five seconds'
-    assert any(line.startswith('phase 3 of 3, steps 2500 of 2500') for line in lines)
-
-
-def test_progress_knows_speed_and_time_left() -> None:
-    clock = Clock()
-    progress = Progress(SETTINGS, io.StringIO(), live=False, clock=clock)
-    assert progress.seconds_left is None
-    for phase in (0, 1):
-        clock.now += 10
-        progress.receive(commit(phase))
-
-    assert progress.steps == 2000
-    assert progress.rate == pytest.approx(100)
-    assert progress.seconds_left == pytest.approx(5)
-
-
-def test_progress_on_a_terminal_shows_phase_evaluation_losses_and_time(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setenv('TERM', 'xterm')
-    monkeypatch.setenv('COLUMNS', '120')
-    stream = io.StringIO()
-    with Progress(SETTINGS, stream, live=True, clock=Clock()) as progress:
-        progress.receive(presence('/run_r/sim'))
-        for record in a_run():
-            progress.receive(record)
-
-    shown = re.sub(r'\x1b\[[^A-Za-z]*[A-Za-z]', '', stream.getvalue())
-    for text in (
-        '3 of 3',
-        '2500 of 2500',
-        'nodes: sim',
-        'score 0.225',
-        'critic loss',
-        'lost messages',
-    ):
-        assert text in shown, text
-
-
-@pytest.mark.parametrize(
-    ('seconds', 'said'), [(0, '0 s'), (59.4, '59 s'), (185, '3:05 min'), (7800, '2:10 h')]
-)
-def test_durations_are_said_as_people_do(seconds: float, said: str) -> None:
-    assert duration(seconds) == said
 
 
 def told(made: Summary) -> tuple[dict[str, Any], str]:
