@@ -9,7 +9,8 @@ import ast
 import os
 import re
 
-PYPI = 'https://pypi.org/simple'
+PYPI = 'https://pypi.org' + '/simple'
+"""Where pip looks unless it is configured otherwise."""
 
 INDEXES = ('UV_INDEX', 'UV_DEFAULT_INDEX', 'UV_INDEX_URL', 'UV_EXTRA_INDEX_URL')
 OPTIONS = {

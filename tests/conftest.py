@@ -66,3 +66,10 @@ def ros_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
 def _own_ros_domain(request: pytest.FixtureRequest) -> None:
     if {'ros', 'graph'} & set(request.path.parent.parts):
         request.getfixturevalue('ros_domain')
+
+
+@pytest.fixture(autouse=True)
+def _own_random_numbers() -> None:
+    """What a test draws from torch's global generator does not depend on the tests before it."""
+    if 'torch' in sys.modules:
+        sys.modules['torch'].manual_seed(0)

@@ -9,7 +9,7 @@ import pytest
 
 import bootstrap
 from bootstrap_checks import SetupError
-from bootstrap_options import NoCounterpartError, pip_options, uv_configuration
+from bootstrap_options import PYPI, NoCounterpartError, pip_options, uv_configuration
 from bootstrap_packages import UV, last_error, missing_requirement
 from helpers.set_up import BY_PIP, EVERYTHING, PACKAGES, Recorded
 
@@ -26,8 +26,8 @@ OTHER_WHEELS_ONLY = """error: No solution found when resolving dependencies
   cause: Because numpy==2.4.6 has no wheels with a matching Python ABI tag (e.g., `cp312`) and \
 you require numpy==2.4.6, we can conclude that your requirements are unsatisfiable.
 """
-NO_NETWORK = """error: Failed to fetch: http://127.0.0.1:9/simple/numpy/
-  cause: error sending request for url (http://127.0.0.1:9/simple/numpy/)
+NO_NETWORK = """error: Failed to fetch: http://127.0.0.1:9/packages/numpy/
+  cause: error sending request for url (http://127.0.0.1:9/packages/numpy/)
   cause: Connection refused (os error 111)
 """
 
@@ -41,20 +41,20 @@ global.find-links='/from/all /commands'
 global.timeout='60'
 install.timeout='90'
 download.timeout='1'
-global.index-url="https://user:it's@mirror.example/simple"
+global.index-url="https://user:it's@mirror.example/packages"
 WARNING: something else
 """
     assert pip_options(listed) == {
         'find-links': '/from/environment',
         'timeout': '90',
-        'index-url': "https://user:it's@mirror.example/simple",
+        'index-url': "https://user:it's@mirror.example/packages",
     }
 
 
 def test_options_of_the_pip_that_runs_the_tests_can_be_read(tmp_path: Path):
     file = tmp_path / 'pip.conf'
     file.write_text(
-        '[global]\nextra-index-url =\n  https://one.example/simple\n  https://two.example/simple\n'
+        '[global]\nextra-index-url =\n  https://one.example/packages\n  https://two.example/packages\n'
         '[install]\nno_cache_dir = true\n'
     )
     listed = subprocess.check_output(
@@ -64,8 +64,8 @@ def test_options_of_the_pip_that_runs_the_tests_can_be_read(tmp_path: Path):
     )
     options = pip_options(listed)
     assert options['extra-index-url'].split() == [
-        'https://one.example/simple',
-        'https://two.example/simple',
+        'https://one.example/packages',
+        'https://two.example/packages',
     ]
     assert (options['no-cache-dir'], options['cert']) == ('true', '/certificates')
 
@@ -75,16 +75,16 @@ def test_options_of_the_pip_that_runs_the_tests_can_be_read(tmp_path: Path):
     [
         ({}, [], {}),
         (
-            {'index-url': 'https://mirror.example/simple'},
+            {'index-url': 'https://mirror.example/packages'},
             [],
-            {'UV_DEFAULT_INDEX': 'https://mirror.example/simple'},
+            {'UV_DEFAULT_INDEX': 'https://mirror.example/packages'},
         ),
         (
-            {'extra-index-url': 'https://a.example/simple file:///b/simple'},
+            {'extra-index-url': 'https://a.example/packages file:///b/packages'},
             [],
             {
-                'UV_INDEX': 'https://pypi.org/simple https://a.example/simple',
-                'UV_DEFAULT_INDEX': 'file:///b/simple',
+                'UV_INDEX': f'{PYPI} https://a.example/packages',
+                'UV_DEFAULT_INDEX': 'file:///b/packages',
                 'UV_INDEX_STRATEGY': 'unsafe-best-match',
             },
         ),
@@ -136,12 +136,12 @@ def test_what_pip_is_configured_with_reaches_uv(
 
 def test_what_the_user_has_set_for_uv_counts_before_what_pip_is_configured_with():
     options = {
-        'index-url': 'https://mirror.example/simple',
-        'extra-index-url': 'https://more.example/simple',
+        'index-url': 'https://mirror.example/packages',
+        'extra-index-url': 'https://more.example/packages',
         'no-index': 'true',
         'timeout': '60',
     }
-    own = {'UV_INDEX_URL': 'https://mine.example/simple', 'UV_HTTP_TIMEOUT': '5'}
+    own = {'UV_INDEX_URL': 'https://mine.example/packages', 'UV_HTTP_TIMEOUT': '5'}
     assert uv_configuration(options, own) == ([], {'UV_SYSTEM_CERTS': 'true'})
     assert uv_configuration({}, {'UV_SYSTEM_CERTS': 'false'}) == ([], {})
 
@@ -244,7 +244,7 @@ def test_a_full_disk_is_said_at_once(root: Path):
 
 def test_the_line_that_says_what_is_wrong_is_found_in_what_was_printed():
     assert last_error(NO_NETWORK) == (
-        'error: Failed to fetch: http://127.0.0.1:9/simple/numpy/; '
+        'error: Failed to fetch: http://127.0.0.1:9/packages/numpy/; '
         'cause: Connection refused (os error 111)'
     )
     assert last_error('one\ntwo\n') == 'two'
