@@ -126,6 +126,7 @@ class RewardModel(nn.Module):
                 nn.init.normal_(layer.weight, std=0.02 / math.sqrt(2 * LAYERS))
         self.adamw = torch.optim.AdamW(self.parameters(), weight_decay=DECAY, fused=True)
         self.register_buffer('version', torch.tensor(0))  # gradient steps taken
+        self.register_buffer('action_first', torch.tensor(1))  # of the two tokens of a step
 
     def forward(self, D: Memory, ids: np.ndarray) -> Tensor:
         """The step rewards w_t rhat_t (B, n) of segments, in units of c."""
@@ -133,10 +134,10 @@ class RewardModel(nn.Module):
         net, place = self.causal, self.causal.position.weight[:DELAY]  # (n, d)
         s = net.observation((s - self.observation_mean) / self.observation_std) + place
         a = net.action(a) + place  # (B, n, d) each
-        h = net.norm_in(torch.stack([s, a], 2).flatten(1, 2))  # (B, 2n, d): s_1, a_1, s_2, ...
+        h = net.norm_in(torch.stack([a, s], 2).flatten(1, 2))  # (B, 2n, d): a_1, s_1, a_2, ...
         for block in net.blocks[:-1]:
             h = block(h, every=1)
-        x = net.norm_out(net.blocks[-1](h, every=2))  # (B, n, d), read at the second of each pair
+        x = net.norm_out(net.blocks[-1](h, every=2))  # (B, n, d), read at the state of each step
         rhat = self.reward(x).squeeze(-1)  # (B, n) (Eq. 5)
         q, k = self.weights.qk(x).chunk(2, -1)  # (B, n, d) each
         w = (SCALE * (q @ k.mT)).softmax(-1).sum(1)  # (B, n), sums over the queries (Eqs. 6, 7)

@@ -45,7 +45,9 @@ def forward(
     position = w['causal.position.weight'][:L]
     s, a = linear('causal.observation', observations), linear('causal.action', actions)
     if settings.tokens == 'pair':
-        h = torch.stack([s + position, a + position], 2).reshape(B, 2 * L, d)
+        h = torch.zeros(B, 2 * L, d, dtype=s.dtype)  # a_1, s_1, a_2, s_2, ...
+        for t in range(L):
+            h[:, 2 * t], h[:, 2 * t + 1] = a[:, t] + position[t], s[:, t] + position[t]
     else:
         h = s + a + position
     N = h.shape[1]  # noqa: N806
@@ -65,7 +67,7 @@ def forward(
         h = h + drop(linear(f'{block}.narrow', wide))
     x = norm('causal.norm_out', h)
     if settings.tokens == 'pair':
-        x = x[:, 1::2]
+        x = x[:, [2 * t + 1 for t in range(L)]]  # at the states
     rhat = linear('reward', x).squeeze(-1)
     if settings.weights == 'one':
         return inside.to(x.dtype), rhat

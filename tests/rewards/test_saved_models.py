@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+import torch
 
 from codetr_ros.cores.labeller import Labeller
-from codetr_ros.rewards import saved
+from codetr_ros.rewards import registry, saved
 from codetr_ros.rewards.base import RewardModelError
 from codetr_ros.runs import checkpoints
 from codetr_ros.runs.checkpoints import CheckpointError
@@ -30,6 +31,26 @@ def test_a_frozen_model_labels_as_it_was_saved_and_each_segment_once(tmp_path):
     memory = core._memory
     expected = np.concatenate(list(made.label_passes(memory, memory.segments.ids()[:3])))
     assert np.array_equal(said[1][0].labels[: len(expected)], expected)
+
+
+@pytest.mark.parametrize('method', ['codetr', 'rbt'])
+def test_a_model_of_pairs_keeps_the_order_of_its_tokens(tmp_path, method):
+    """Old models, which state no order, have the state first."""
+    core, _ = trained(tmp_path, method=method, **{'codetr.tokens': 'pair'})
+    new, memory = core.method, core._memory
+    state = new.state()
+    batch = memory.segments.batch(memory.segments.ids(), new.context)
+    assert state['action_first'] == 1
+
+    old = registry.make(core._settings, memory.observation_size, memory.action_size)
+    old.load_state({name: x for name, x in state.items() if name != 'action_first'})
+    swapped = registry.make(core._settings, memory.observation_size, memory.action_size)
+    swapped.load_state(state)
+    torch.testing.assert_close(torch.tensor(swapped.label(batch)), torch.tensor(new.label(batch)))
+    assert not np.allclose(old.label(batch), new.label(batch))
+    again = registry.make(core._settings, memory.observation_size, memory.action_size)
+    again.load_state(old.state())
+    assert np.array_equal(again.label(batch), old.label(batch))
 
 
 def test_a_frozen_rule_keeps_what_it_knew_of_scores(tmp_path):

@@ -84,6 +84,24 @@ def test_with_the_same_masks_outputs_and_gradients_are_those_of_the_plain_form(
             torch.testing.assert_close(fast, oracle, rtol=1e-6, atol=1e-9)
 
 
+def test_without_attention_a_pair_is_its_state_alone_and_with_it_the_state_and_the_action_before():
+    """The order of the published code: (a_1, s_1, a_2, s_2, ...), read at the states."""
+    torch.manual_seed(0)
+    network = RewardTransformer(O, A, L, settings(tokens='pair', layers=1)).eval()
+    observations, actions, inside = inputs()
+    others = torch.randn_like(actions)
+    with torch.no_grad():
+        attentive = [network(observations, a, inside)[1] for a in (actions, others)]
+        earlier = torch.cat([actions[:, :3], others[:, 3:]], 1)
+        until = network(observations, earlier, inside)[1]
+        network.causal.blocks[0].attention.out.weight.zero_()
+        alone = [network(observations, a, inside)[1] for a in (actions, others)]
+        moved = network(torch.randn_like(observations), actions, inside)[1]
+    assert torch.equal(*alone) and not torch.isclose(moved, alone[0]).any()
+    assert not torch.isclose(*attentive).any(), 'a step is read after its action'
+    torch.testing.assert_close(until[:, :3], attentive[0][:, :3])
+
+
 @pytest.mark.parametrize('tokens', ['pair', 'merged'])
 def test_without_training_nothing_is_dropped(tokens):
     chosen = settings(tokens=tokens, dropout=0.5)

@@ -44,8 +44,8 @@ class CodetrSettings(Group):
     )
     tokens: Literal['pair', 'merged'] = Field(
         'pair',
-        description='pair: a state and an action token per step, as in the paper; merged: one '
-        'token per step, twice as fast',
+        description='pair: an action and a state token per step, read at the state, as in the '
+        'published code of this family; merged: one token per step, twice as fast',
     )
     head_scale: Literal['inverse', 'inverse_sqrt', 'one'] = Field(
         'inverse_sqrt',

@@ -22,8 +22,8 @@ Differences from the published code, as far as it could be read; the paper itsel
   many windows as make up `codetr.batch` segments (fewer where an episode has fewer before it).
 * There the loss on sums is divided by the number of steps, here by that of segments: it does not
   shrink where segments are long.
-* There actions precede states among the tokens, and the next state is predicted from the action's
-  token, which has not seen the state. Here the token has seen both.
+* There the next state is predicted from the action's token, which has not seen the state. Here it
+  is predicted from the state's token, which has seen both.
 * There a step's label is the output of the last step of the window of H = 100 steps that ends with
   it, as here if `codetr.labelling` is 'window'. By default a segment's steps are labelled in one
   pass, from the window of segments that ends with theirs.

@@ -2,7 +2,7 @@
 
 import math
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -17,6 +17,7 @@ from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import F32
 from codetr_ros.rewards.base import RewardModelError, segment_steps
 from codetr_ros.rewards.learned import Learned
+from codetr_ros.rewards.transformer import CausalTransformer
 from codetr_ros.system import freed_memory
 
 ARRAY_BYTES = 16 << 20
@@ -88,6 +89,31 @@ class SequenceMethod(Learned):
                 rewards = self._read_off(self._standardised(observations), actions, inside)
                 labels.append(rewards[own].cpu().numpy())
         return self._in_unit(np.concatenate(labels))
+
+    def state(self) -> dict[str, Tensor]:
+        """What every network has, and for pairs of tokens which one is first."""
+        if self._codetr.tokens == 'merged':
+            return super().state()
+        return super().state() | {'action_first': torch.tensor(int(self._causal.action_first))}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Go on from a `state()`. One that names no order of tokens has the state first.
+
+        Raises:
+            RewardModelError: it is another method's or architecture's; nothing has changed then.
+        """
+        if self._codetr.tokens == 'merged':
+            super().load_state(state)
+            return
+        state = {'action_first': torch.tensor(0), **state}
+        super().load_state(state)
+        self._causal.action_first = bool(state['action_first'])
+
+    @property
+    def _causal(self) -> CausalTransformer:
+        causal = self.network.get_submodule('causal')
+        assert isinstance(causal, CausalTransformer)
+        return causal
 
     @property
     def single_steps(self) -> bool:

@@ -108,9 +108,15 @@ class Block(nn.Module):
 class CausalTransformer(nn.Module):
     """Maps steps to causal states: x_t has seen everything up to step t and nothing after it.
 
-    Tokens are `pair` (s_1, a_1, s_2, a_2, ...), read at the action, or `merged`, one for each
+    Tokens are `pair` (a_1, s_1, a_2, s_2, ...), read at the state, which has seen the action of
+    its step: the order of the published code of this family. Or they are `merged`, one for each
     step. The last layer leaves out the tokens that are not read: nothing depends on them there. A
     step's position is its place in the window, whatever its time in the episode.
+    """
+
+    action_first: bool = True
+    """Whether the action is the first token of a pair. Models of old checkpoints have the state
+    first, and are read at the action.
     """
 
     def __init__(
@@ -134,7 +140,10 @@ class CausalTransformer(nn.Module):
         a = self.action(actions)  # (B, L, d)
         position = self.position.weight[: s.shape[1]]  # (L, d)
         if self.pair:
-            tokens = torch.stack([s + position, a + position], 2).flatten(1, 2)  # (B, 2L, d)
+            first, second = (a, s) if self.action_first else (s, a)
+            tokens = torch.stack([first + position, second + position], 2).flatten(
+                1, 2
+            )  # (B, 2L, d)
         else:
             tokens = s + a + position  # (B, L, d)
         h = self.norm_in(tokens)  # (B, N, d)
