@@ -7,7 +7,7 @@ from scipy.stats import multivariate_normal
 
 from codetr_ros.rewards.evidence import links, scales
 from codetr_ros.rewards.evidence.features import DRIFT, Features, Moments, moments, sums
-from codetr_ros.rewards.evidence.maxima import Minimum, SoftMax
+from codetr_ros.rewards.evidence.maxima import Minimum, PeakEnd, SoftMax
 from codetr_ros.rewards.evidence.regression import noise, posterior
 from codetr_ros.rewards.evidence.sample import chosen
 from codetr_ros.rewards.evidence.scales import JITTER, Evidence, Linear
@@ -142,6 +142,7 @@ def score(name: str, rewards: np.ndarray) -> float:
         'minimum': up @ rewards,
         'max_times_n': 7 * (soft @ rewards),
         'max_hard': rewards.max(),
+        'peak_end': (rewards.max() + rewards[-1]) / 2,
         'max_log_sum_exp': np.log(np.exp(BETA * rewards).sum()) / BETA,
     }[name]
 
@@ -191,7 +192,7 @@ def test_the_slope_of_the_level_by_the_score_is_that_of_finite_differences(name)
     np.testing.assert_allclose(np.exp(made.log_slope(scores, M)), slope, rtol=1e-6)
 
 
-@pytest.mark.parametrize('kind', [SoftMax, Minimum])
+@pytest.mark.parametrize('kind', [SoftMax, Minimum, PeakEnd])
 def test_the_slope_by_the_temperature_is_that_of_finite_differences(kind):
     f = np.random.default_rng(5).normal(size=15)
     made = kind(BETA, learnt=True)

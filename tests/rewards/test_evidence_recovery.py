@@ -37,10 +37,6 @@ def fitted(memory: Trajectories, **changes: object) -> Evidence:
 
 def told(kind: str, **how: object) -> Trajectories:
     """A running task of which composite rewards of a kind are told."""
-    if kind == 'minimum':
-        return planted.memory(
-            planted.progress, lambda r: -composite('max', -r, BETA, DELAY), **how
-        )
     return planted.memory(planted.progress, lambda r: composite(kind, r, BETA, DELAY), **how)
 
 

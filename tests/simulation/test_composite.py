@@ -44,6 +44,13 @@ def test_every_type_of_the_configuration_has_its_formula():
             * (math.exp(3) - 2 * math.exp(-6) + 3 * math.exp(9))
             / (math.exp(3) + math.exp(-6) + math.exp(9)),
         ),
+        # softmax(-3, 6, -9) of 1, -2, 3
+        (
+            'minimum',
+            (math.exp(-3) - 2 * math.exp(6) + 3 * math.exp(-9))
+            / (math.exp(-3) + math.exp(6) + math.exp(-9)),
+        ),
+        ('peak_end', 3.0),
     ],
 )
 def test_three_rewards_make_the_value_worked_out_by_hand(name, value):
@@ -68,6 +75,25 @@ def test_the_soft_maximum_lies_between_mean_and_maximum(rewards, beta):
 
 
 @given(rewards=segments, beta=st.floats(0.01, 100))
+def test_the_soft_minimum_lies_between_minimum_and_mean(rewards, beta):
+    value = composite('minimum', rewards, beta, 12)
+    assert rewards.min() - 1e-9 <= value <= rewards.mean() + 1e-9
+
+
+@given(rewards=segments)
+def test_peak_and_end_are_the_best_step_and_the_last_one_in_equal_parts(rewards):
+    best, last = -math.inf, math.nan
+    for last in rewards.tolist():
+        best = last if last > best else best
+    assert composite('peak_end', rewards, 3.0, 12) == (best + last) / 2
+
+
+@pytest.mark.parametrize(('rewards', 'value'), [((5, 1), 3), ((-9, -1), -1), ((2, -9, 0), 1)])
+def test_a_bad_step_is_no_peak_however_bad(rewards, value):
+    assert of('peak_end', *rewards) == value
+
+
+@given(rewards=segments, beta=st.floats(0.01, 100))
 def test_log_sum_exp_exceeds_the_maximum_by_at_most_the_logarithm_of_the_length(rewards, beta):
     excess = composite('max_log_sum_exp', rewards, beta, 12) - rewards.max()
     assert -1e-9 <= excess <= math.log(len(rewards)) / beta + 1e-9
@@ -85,7 +111,7 @@ def test_a_large_beta_makes_the_soft_maximum_the_maximum(name):
 
 @given(reward=st.floats(-1000, 1000))
 def test_a_segment_of_one_step_gives_its_reward_or_signed_square(reward):
-    for name in ('sum', 'max', 'max_hard', 'max_log_sum_exp'):
+    for name in ('sum', 'max', 'max_hard', 'max_log_sum_exp', 'minimum', 'peak_end'):
         assert of(name, reward) == pytest.approx(reward)
     for name in ('sum_square', 'square_sum'):
         assert of(name, reward) == pytest.approx(abs(reward) * reward)
@@ -96,6 +122,11 @@ def test_maxima_of_rewards_whose_exponential_overflows_are_exact(name):
     factor = 2 if name == 'max_times_n' else 1
     assert of(name, 1e6, -1e6, delay=2) == factor * 1e6
     assert of(name, -1e300, -2e300, beta=1000, delay=2) == factor * -1e300
+
+
+def test_a_minimum_of_rewards_whose_exponential_overflows_is_exact():
+    assert of('minimum', 1e6, -1e6, delay=2) == -1e6
+    assert of('minimum', 1e300, 2e300, beta=1000, delay=2) == 1e300
 
 
 def test_max_times_n_has_the_delay_as_factor_in_a_shorter_segment_too():
@@ -118,6 +149,8 @@ def test_rewards_of_lower_precision_are_summed_in_float64():
         ('max_hard', 240),
         ('max_times_n', 6000),
         ('max_log_sum_exp', 40 * (6 + math.log(25) / 3)),
+        ('minimum', 240),
+        ('peak_end', 240),
     ],
 )
 def test_the_perfect_score_is_that_of_the_papers_normalisation(name, score):

@@ -28,7 +28,15 @@ from codetr_ros.config.schedule import Schedule
 from codetr_ros.records import PROTOCOL_VERSION, RunSpec
 
 Composite = Literal[
-    'sum', 'sum_square', 'square_sum', 'max', 'max_hard', 'max_log_sum_exp', 'max_times_n'
+    'sum',
+    'sum_square',
+    'square_sum',
+    'max',
+    'max_hard',
+    'max_log_sum_exp',
+    'max_times_n',
+    'minimum',
+    'peak_end',
 ]
 
 
@@ -70,7 +78,9 @@ class Settings(Schedule, Group):
     composite: Composite = Field(
         'sum', description="how a segment's rewards make its composite reward"
     )
-    beta: float = Field(3.0, gt=0, le=1000, description='inverse temperature of the soft maximum')
+    beta: float = Field(
+        3.0, gt=0, le=1000, description='inverse temperature of the soft maximum and minimum'
+    )
     delay: int = Field(
         25,
         ge=1,

@@ -4,7 +4,8 @@ The delay n cuts every episode, from its start, into segments of n steps; the la
 and is scored by the same formula. All numbers are float64. How certain each formula is: the
 supplement states the types and beta, not all of the formulas. Signed squares follow from the
 negative scores in its Table 2, and the softmax reading of Max from its word "scaling parameter".
-The other maxima are variants by name.
+The other maxima are variants by name. `minimum` and `peak_end` are not the paper's: they are kinds
+of score that no method was made for.
 
 All formulas in a table: docs/methods.md#composite-rewards.
 """
@@ -63,6 +64,21 @@ def _max_times_n(rewards: F64, beta: float, delay: int) -> float:
     return delay * _max(rewards, beta, delay)
 
 
+def _minimum(rewards: F64, beta: float, delay: int) -> float:
+    """Sum of softmax(-beta r)_t r_t: the soft maximum of -r, negated."""
+    return -_max(-rewards, beta, delay)
+
+
+def _peak_end(rewards: F64, beta: float, delay: int) -> float:
+    """The mean of the best and the last step: how people remember an experience.
+
+    The peak-end rule (Kahneman, Fredrickson, Schreiber and Redelmeier, 1993, recalled) takes the
+    most intense moment for the peak, good or bad. Here it is the largest reward (decided here), so
+    that no step can lower a score by being better.
+    """
+    return (float(rewards.max()) + float(rewards[-1])) / 2
+
+
 COMPOSITES: dict[str, Callable[[F64, float, int], float]] = {
     'sum': _sum,
     'sum_square': _sum_square,
@@ -71,6 +87,8 @@ COMPOSITES: dict[str, Callable[[F64, float, int], float]] = {
     'max_hard': _max_hard,
     'max_log_sum_exp': _max_log_sum_exp,
     'max_times_n': _max_times_n,
+    'minimum': _minimum,
+    'peak_end': _peak_end,
 }
 """The types by name: functions of rewards (m,), beta and delay n."""
 

@@ -1,4 +1,4 @@
-"""The links by name: those of the composite rewards, the mean and the minimum."""
+"""The links by name: those of the composite rewards, and the mean."""
 
 from collections.abc import Callable
 
@@ -8,6 +8,7 @@ from codetr_ros.rewards.evidence.maxima import (
     MaxLogSumExp,
     MaxTimesN,
     Minimum,
+    PeakEnd,
     SoftMax,
 )
 
@@ -23,9 +24,10 @@ _MAKE: dict[str, Callable[[float, int], Link]] = {
     'max_times_n': MaxTimesN,
     'max_log_sum_exp': lambda beta, delay: MaxLogSumExp(beta),
     'max_hard': lambda beta, delay: MaxHard(HARD, learnt=True),
+    'peak_end': lambda beta, delay: PeakEnd(HARD, learnt=True),
 }
 NAMES = tuple(_MAKE)
-"""Links by name: those of the composite rewards, the mean and the minimum."""
+"""Links by name: those of the composite rewards, and the mean. Saved models hold their places."""
 
 
 def make(name: str, beta: float, delay: int) -> Link:

@@ -2,8 +2,8 @@
 
 The formulas: docs/methods.md#evidence. From the trial: the soft maximum and how its beta is
 learnt. Decided here: the others as the soft one. The hard maximum is learnt as a soft one of large
-beta and explained to the letter, log-sum-exp has its own level and F, and the minimum is the
-maximum of what is negated.
+beta and explained to the letter, log-sum-exp has its own level and F, the minimum is the maximum
+of what is negated, and the peak of peak and end is treated as the hard maximum.
 """
 
 import math
@@ -127,6 +127,30 @@ class MaxHard(SoftMax):
     def shift(self, f: F64, level: F64, starts: I64, m: I64) -> F64:
         """What lifts the largest step to the level."""
         return level - np.maximum.reduceat(f, starts)
+
+
+class PeakEnd(SoftMax):
+    """The mean of the largest and the last step reward: the largest is learnt as a soft maximum,
+    explained to the letter.
+    """
+
+    name = 'peak_end'
+
+    def forward(self, f: F64, starts: I64, m: I64) -> tuple[F64, F64]:
+        """The mean of the soft maximum and of the last f, and half of either's slopes."""
+        level, slopes = super().forward(f, starts, m)
+        ends = starts + m - 1
+        slopes[ends] += 1
+        return (level + f[ends]) / 2, slopes / 2
+
+    def beta_slope(self, f: F64, starts: I64, m: I64) -> F64:
+        """Half of that of the soft maximum."""
+        return super().beta_slope(f, starts, m) / 2
+
+    def shift(self, f: F64, level: F64, starts: I64, m: I64) -> F64:
+        """What lifts the mean of the largest and the last step to the level."""
+        found: F64 = level - (np.maximum.reduceat(f, starts) + f[starts + m - 1]) / 2
+        return found
 
 
 class MaxLogSumExp(SoftMax):
