@@ -1,6 +1,6 @@
 """Write settings.md from the settings themselves: `python docs/settings_page.py`.
 
-The page, `codetr train --help`, the ROS parameters and the refusals thus have one source: the
+The page, `codetr train --help-all`, the ROS parameters and the refusals thus have one source: the
 descriptions in `codetr_ros/config/`. A test holds that the page is current.
 """
 
@@ -18,8 +18,9 @@ HEAD = """\
 # Settings
 
 Everything that the parts of a run must agree on. This page is generated from the descriptions in
-the code, as are `codetr train --help` and the ROS parameters (`ros2 param describe /run_1/learner
-delay`), so all three agree.
+the code, as are `codetr train --help-all` and the ROS parameters (`ros2 param describe
+/run_1/learner delay`), so all three agree. `codetr train --help` explains the twenty that people
+change most.
 
 A setting has one name everywhere:
 

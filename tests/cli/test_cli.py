@@ -89,7 +89,7 @@ def test_help_shows_the_defaults_and_ranges_of_the_chosen_config(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     with pytest.raises(SystemExit) as left:
-        parse('--config', 'paper', '--help')
+        parse('--config', 'paper', '--help-all')
 
     assert left.value.code == 0
     shown = ' '.join(capsys.readouterr().out.replace('│', ' ').split())

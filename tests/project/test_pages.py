@@ -40,7 +40,7 @@ def help_of(*command: str) -> str:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv('COLUMNS', '300')  # nothing is wrapped
         with contextlib.redirect_stdout(written), contextlib.suppress(SystemExit):
-            main([*command, '--help'])
+            main([*command, '--help-all' if command[0] in ('train', 'fit') else '--help'])
     return written.getvalue()
 
 

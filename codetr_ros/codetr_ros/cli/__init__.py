@@ -24,7 +24,8 @@ commands:
   tasks      list the tasks that have a name
   doctor     check Python, ROS, discovery, shared memory, torch and MuJoCo
 
-`codetr COMMAND --help` explains the options of a command; `codetr --version` prints the version.
+`codetr COMMAND --help` explains the options of a command (of `train` and `fit` the settings that
+people change most; `--help-all` explains all); `codetr --version` prints the version.
 """
 
 

@@ -13,7 +13,7 @@ from rich.console import Console
 from codetr_ros import config
 from codetr_ros.bags.errors import BagError
 from codetr_ros.cli import FAILED, refuse
-from codetr_ros.cli.flags import settings_fields
+from codetr_ros.cli.flags import HELP_ALL_FIELD, explained, settings_fields
 from codetr_ros.config import Settings, SettingsError
 from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.settings import OF_NO_EFFECT, FitSettings
@@ -44,6 +44,7 @@ def _own_fields() -> list[tuple[str, Any, Any]]:
     return [
         ('bags', bags, dataclasses.field()),
         field('out', str, dataclasses.field(), 'DIR', 'output folder, new or empty'),
+        HELP_ALL_FIELD,
         field(
             'config',
             str | None,
@@ -90,15 +91,13 @@ def parse(arguments: Sequence[str], base: Settings) -> Arguments:
 
     Raises:
         SettingsError: a value is out of range.
-        SystemExit: after `--help`, or for a flag that does not exist.
+        SystemExit: after `--help` or `--help-all`, or for a flag that does not exist.
     """
     own, fit = _own_fields(), settings_fields(FitSettings())
-    shown = [field for field in settings_fields(base) if field[0] not in OF_NO_EFFECT]
+    words, shown, text = explained(arguments, base, DESCRIPTION, OF_NO_EFFECT)
     kind = dataclasses.make_dataclass('Arguments', [*own, *fit, *shown], frozen=True)
-    kind.__doc__ = DESCRIPTION
-    values = dataclasses.asdict(
-        tyro.cli(kind, prog='codetr fit', description=DESCRIPTION, args=arguments)
-    )
+    kind.__doc__ = text
+    values = dataclasses.asdict(tyro.cli(kind, prog='codetr fit', description=text, args=words))
     mine = {field[0]: values.pop(field[0]) for field in own}
     fitting = {field[0]: values.pop(field[0]) for field in fit}
     return Arguments(

@@ -6,7 +6,7 @@ values are collected first and validated once, by `config.parse`.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Annotated, Any
 
 import tyro
@@ -17,6 +17,25 @@ from codetr_ros import config
 from codetr_ros.config import Settings, SettingsError
 
 _BOUNDS = {'ge': '>=', 'gt': '>', 'le': '<=', 'lt': '<'}
+
+HELP, HELP_ALL = ('-h', '--help'), '--help-all'
+HELP_ALL_FIELD = (
+    'help_all',
+    Annotated[
+        bool,
+        tyro.conf.FlagCreatePairsOff,
+        tyro.conf.arg(help='show this help message with every setting and exit'),
+    ],
+    False,
+)
+"""Lists `--help-all`, on which `explained` acts."""
+COMMON = (
+    *('task', 'composite', 'delay', 'method', 'steps', 'seed', 'warmup_steps', 'memory_steps'),
+    *('overlap', 'simulators', 'envs', 'evaluate_every', 'evaluate_episodes', 'r_max'),
+    *('threads', 'device', 'reward_device', 'codetr.label', 'codetr.gradient_steps'),
+    'sac.hidden',
+)
+"""The settings that people change most, by dotted name: `--help` explains these alone."""
 
 
 def _help(field: FieldInfo) -> str:
@@ -29,24 +48,59 @@ def _help(field: FieldInfo) -> str:
     return (field.description or '') + (f' [{", ".join(bounds)}]' if bounds else '')
 
 
-def settings_fields(group: BaseModel) -> list[tuple[str, Any, Any]]:
-    """Fields for `dataclasses.make_dataclass`: name, annotated type, default from `group`."""
+def settings_fields(
+    group: BaseModel, only: Collection[str] | None = None, prefix: str = ''
+) -> list[tuple[str, Any, Any]]:
+    """Fields for `dataclasses.make_dataclass`: name, annotated type, default from `group`.
+
+    Args:
+        group: the settings.
+        only: dotted names of the settings that get a field; None: all.
+        prefix: of the dotted names of this group.
+    """
     fields: list[tuple[str, Any, Any]] = []
     for name, field in type(group).model_fields.items():
         value = getattr(group, name)
+        dotted = f'{prefix}{name}'
         text = tyro.conf.arg(help=_help(field))
         if isinstance(value, BaseModel):
-            nested = dataclasses.make_dataclass(
-                type(value).__name__, settings_fields(value), frozen=True
-            )
+            inner = settings_fields(value, only, f'{dotted}.')
+            if not inner:
+                continue
+            nested = dataclasses.make_dataclass(type(value).__name__, inner, frozen=True)
             nested.__doc__ = field.description
             default = dataclasses.field(default_factory=nested)
             fields.append((name, Annotated[nested, text], default))
-        else:
+        elif only is None or dotted in only:
             fields.append(
                 (name, Annotated[field.annotation, text], dataclasses.field(default=value))
             )
     return fields
+
+
+def explained(
+    arguments: Sequence[str], base: Settings, description: str, left_out: Collection[str] = ()
+) -> tuple[list[str], list[tuple[str, Any, Any]], str]:
+    """The settings as flags: all of them, but for `--help`, which explains the common ones alone.
+
+    Args:
+        arguments: the command's arguments.
+        base: the settings whose values are the defaults.
+        description: what the command does.
+        left_out: settings, and groups of them, that the command does not take.
+
+    Returns:
+        The arguments for the parser, with `--help` for `--help-all`; the fields of the settings;
+        and the description, which names `--help-all` where it is needed.
+    """
+    fields = [field for field in settings_fields(base) if field[0] not in left_out]
+    if HELP_ALL in arguments:
+        return [HELP[1]], fields, description
+    if not any(argument in HELP for argument in arguments):
+        return list(arguments), fields, description
+    common = [field for field in settings_fields(base, COMMON) if field[0] not in left_out]
+    note = f'The settings below are those that people change most; {HELP_ALL} explains all.'
+    return [HELP[1]], common, f'{description}\n\n{note}'
 
 
 def chosen_config(arguments: Sequence[str], default: str) -> str:
@@ -80,7 +134,7 @@ def parse(
     Args:
         arguments: the command's arguments.
         prog: its name.
-        description: what it does, for `--help`.
+        description: what it does, for its help.
         default: the configuration whose values are the defaults, unless `--config` names another.
         more: further fields (name, annotated type, `dataclasses.field`), shown before the
             settings.
@@ -90,19 +144,21 @@ def parse(
 
     Raises:
         SettingsError: a value is out of range, or the configuration cannot be read.
-        SystemExit: code 0 after `--help`, 2 for a flag that does not exist or a value of the wrong
-            type.
+        SystemExit: code 0 after `--help` or `--help-all`, 2 for a flag that does not exist or a
+            value of the wrong type.
     """
     name = chosen_config(arguments, default)
     base = config.load(name)
     text = f'{", ".join(config.PRESETS)} or a YAML file: the defaults of all other flags'
     own = [
+        HELP_ALL_FIELD,
         ('config', Annotated[str, tyro.conf.arg(metavar='NAME|FILE', help=text)], name),
         *more,
     ]
-    kind = dataclasses.make_dataclass('Arguments', [*own, *settings_fields(base)], frozen=True)
+    given, fields, description = explained(arguments, base, description)
+    kind = dataclasses.make_dataclass('Arguments', [*own, *fields], frozen=True)
     kind.__doc__ = description
-    values = dataclasses.asdict(tyro.cli(kind, prog=prog, description=description, args=arguments))
+    values = dataclasses.asdict(tyro.cli(kind, prog=prog, description=description, args=given))
     extra = {field[0]: values.pop(field[0]) for field in own}
     settings = config.parse(values, 'command line')
     return settings, extra
