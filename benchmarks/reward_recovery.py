@@ -13,9 +13,9 @@ variant (CoDeTr, changed in one setting, or another method) it gives
     within_spearman    the segment? nan for methods that give the same to all of its steps
     weights_sd         standard deviation of CoDeTr's attention weights w (1 on average)
 
-over held-out steps. A high R^2 shows little about the steps, hence the other columns. `ircr` and
-`uniform` take no gradient steps, whatever the value in their column. Rows that are in the file
-already are not run again. Means over seeds go beside it as Markdown.
+over held-out steps. A high R^2 shows little about the steps, hence the other columns. `ircr`,
+`uniform` and `random` take no gradient steps, whatever the value in their column. Rows that are in
+the file already are not run again. Means over seeds go beside it as Markdown.
 """
 
 import argparse
@@ -65,6 +65,7 @@ VARIANTS: dict[str, dict[str, object]] = {
     'method evidence': {'method': 'evidence'},
     'method evidence, link chosen': {'method': 'evidence', 'evidence.link': 'choose'},
     'method uniform': {'method': 'uniform'},
+    'method random': {'method': 'random'},
 }
 COLUMNS = (
     'composite',

@@ -27,6 +27,7 @@ CASES = [
     (PENDULUM, 'ircr', 'overlap'),
     (REACHER, 'mlp', 'lock-step'),
     (PENDULUM, 'uniform', 'overlap'),
+    (REACHER, 'random', 'lock-step'),
     (REACHER, 'evidence', 'lock-step'),
     (PENDULUM, 'evidence', 'overlap'),
 ]

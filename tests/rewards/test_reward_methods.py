@@ -350,6 +350,50 @@ class TestUniform(Rule):
         return np.full(len(true), value / len(true), np.float32)
 
 
+class TestRandom(Contract):
+    method = 'random'
+
+    def test_the_labels_of_a_segment_have_its_sign_and_sum_to_its_score(self):
+        memory = filled()
+        made = self.trained(memory, reward_unit='raw')
+        batch = batch_of(memory, made)
+        labels = made.label(batch)
+        np.testing.assert_allclose(labels.sum(1), batch.values, rtol=1e-6)
+        assert (labels * batch.values[:, None] >= 0).all()
+
+    def test_each_segment_and_each_seed_has_weights_of_its_own(self):
+        memory = filled()
+        one, other = self.trained(memory), self.trained(memory, seed=1)
+        batch = batch_of(memory, one)
+        weights = np.concatenate(
+            [made.label(batch) / made.label(batch).sum(1, keepdims=True) for made in (one, other)]
+        )
+        assert len({row.round(6).tobytes() for row in weights}) == len(weights) == 14
+
+    def test_a_segment_has_the_same_labels_with_context_and_in_another_memory(self):
+        memory, made = filled(), self.make()
+        made.prepare(memory)
+        ids = memory.segments.ids()
+        plain, after = memory.segments.batch(ids), memory.segments.batch(ids, 4)
+        np.testing.assert_array_equal(
+            made.label(after)[segment_steps(after)], made.label(plain)[segment_steps(plain)]
+        )
+        elsewhere = filled(true_rewards=False).segments.batch(ids)
+        np.testing.assert_array_equal(made.label(elsewhere), made.label(plain))
+
+    def test_weights_are_uniform_among_all_that_sum_to_one(self):
+        """Each of m weights then exceeds x with probability (1 - x)^(m - 1)."""
+        memory = linear_rewards.memory((7,) * 900, 7)
+        made = self.trained(memory)
+        labels = made.label(batch_of(memory, made))
+        weights = labels / labels.sum(1, keepdims=True)
+        assert weights.shape == (900, 7)
+        np.testing.assert_allclose(weights.mean(0), 1 / 7, atol=4 * np.sqrt(6 / 392 / 900))
+        np.testing.assert_allclose(weights.var(0), 6 / 392, rtol=0.3)
+        for share in (0.1, 0.3, 0.5):
+            assert np.mean(weights > share) == pytest.approx((1 - share) ** 6, abs=0.02)
+
+
 class TestTrueReward(Rule):
     method = 'true'
 

@@ -75,7 +75,7 @@ def _paper_line(composite: str, order: Sequence[str]) -> list[str | Bold]:
     return [*cells, NONE, NONE]
 
 
-_ANCHORS = {'random': 'random', 'zero': 'standing still'}
+_ANCHORS = {'random': 'random policy', 'zero': 'standing still'}
 
 
 def _anchor(row: Row, anchors: Anchors, which: str) -> str:
@@ -100,7 +100,7 @@ def _reading() -> list[Block]:
                 'never marked as best, nor compared.',
                 '[n of m, k failed]: only n of m cells have finished; the mean is over those, '
                 'whose delays and seeds may differ from those of other entries.',
-                'random, standing still: the trivial anchors, mean over the same delays.',
+                'random policy, standing still: the trivial anchors, mean over the same delays.',
             ]
         )
     ]
@@ -198,12 +198,12 @@ def anchors(known: Anchors) -> list[Block]:
         ]
         for (task, composite, delay), by in known.items()
     ]
-    head = ['task', 'composite', 'delay', 'random: score', 'standing still: score']
+    head = ['task', 'composite', 'delay', 'random policy: score', 'standing still: score']
     return [
         Heading('Trivial anchors'),
         Paragraph(
             'A uniformly random policy, and one that stands still (action 0). A method that does '
             'not beat both has learnt nothing that counts.'
         ),
-        Table([*head, 'random: return', 'standing still: return'], lines),
+        Table([*head, 'random policy: return', 'standing still: return'], lines),
     ]

@@ -51,6 +51,7 @@ Method = Literal[
     'mlp',
     'evidence',
     'uniform',
+    'random',
     'true',
     'ones',
 ]

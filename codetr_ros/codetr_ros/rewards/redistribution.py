@@ -6,13 +6,18 @@ All of them state their rewards in the unit of the reward transformer (`target_s
 The rules in a table: docs/methods.md#fixed-rules.
 """
 
+import hashlib
 from abc import abstractmethod
+from collections.abc import Mapping
 
 import numpy as np
+import torch
 
+from codetr_ros.config import Settings
 from codetr_ros.memory.batches import SegmentBatch
 from codetr_ros.records import F32, F64
 from codetr_ros.rewards.base import RewardMethod, RewardModelError, segment_steps
+from codetr_ros.seeding import generator
 
 
 class Redistribution(RewardMethod):
@@ -51,6 +56,44 @@ class Uniform(Redistribution):
     def _rule(self, batch: SegmentBatch, unit: float) -> F64:
         rewards: F64 = (batch.values / (batch.lengths - batch.context) / unit)[:, None]
         return rewards
+
+
+class Random(Redistribution):
+    """A control: R split by random weights w of a segment's steps, w R on each; sum w = 1.
+
+    All weights that sum to 1 are equally likely (normalised exponential numbers). They are drawn
+    from the seed and what the segment's steps were, so that a segment has the same labels whenever
+    and wherever it is labelled.
+    """
+
+    name = 'random'
+
+    def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
+        super().__init__(settings, observation_size, action_size)
+        self._seed = settings.seed
+
+    def _rule(self, batch: SegmentBatch, unit: float) -> F64:
+        rewards = np.zeros(batch.actions.shape[:2])
+        for i, value in enumerate((batch.values / unit).tolist()):
+            own = slice(int(batch.context[i]), int(batch.lengths[i]))
+            steps = batch.observations[i, own].tobytes() + batch.actions[i, own].tobytes()
+            rng = generator(self._seed, self.name, hashlib.sha256(steps).hexdigest())
+            weights = rng.standard_exponential(own.stop - own.start)
+            rewards[i, own] = value * weights / weights.sum()
+        return rewards
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """The seed of the weights, and the target scale."""
+        return super().state() | {'seed': torch.tensor(self._seed, dtype=torch.int64)}
+
+    def load_state(self, state: Mapping[str, torch.Tensor]) -> None:
+        """Go on from a `state()`.
+
+        Raises:
+            RewardModelError: it is another method's; nothing has changed then.
+        """
+        super().load_state(state)
+        self._seed = int(state['seed'])
 
 
 class TrueReward(Redistribution):

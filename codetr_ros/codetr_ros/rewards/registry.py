@@ -7,12 +7,24 @@ from codetr_ros.rewards.evidence.method import Evidence
 from codetr_ros.rewards.ircr import Ircr
 from codetr_ros.rewards.mlp import Mlp
 from codetr_ros.rewards.rbt import Rbt
-from codetr_ros.rewards.redistribution import LastStep, Ones, TrueReward, Uniform
+from codetr_ros.rewards.redistribution import LastStep, Ones, Random, TrueReward, Uniform
 from codetr_ros.rewards.rrd import Rrd
 
 METHODS: dict[str, type[RewardMethod]] = {
     method.name: method
-    for method in (Codetr, LastStep, Rbt, Rrd, Ircr, Mlp, Evidence, Uniform, TrueReward, Ones)
+    for method in (
+        Codetr,
+        LastStep,
+        Rbt,
+        Rrd,
+        Ircr,
+        Mlp,
+        Evidence,
+        Uniform,
+        Random,
+        TrueReward,
+        Ones,
+    )
 }
 """Reward methods by their name in `settings.method`."""
 
