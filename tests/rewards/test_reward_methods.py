@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from codetr_ros.config import IN_PROCESS_ONLY, SCORE_LEARNERS, Method, Settings
+from codetr_ros.config import IN_PROCESS_ONLY, SCORE_LEARNERS, Composite, Method, Settings
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import F32
 from codetr_ros.rewards import registry
 from codetr_ros.rewards.base import RewardMethod, RewardModelError, Schedule, segment_steps
 from codetr_ros.seeding import generator, seed_torch
-from helpers import builders, linear_rewards
+from codetr_ros.simulation.composite import composite
+from helpers import builders, linear_rewards, planted
 from helpers.builders import ACTION as A
 from helpers.builders import OBSERVATION as O
 from helpers.reward_data import DELAY, LENGTHS, batch_of, equal, filled
@@ -25,7 +26,8 @@ class Contract:
 
     method: Method
     changes: ClassVar[dict[str, Any]] = {}
-    has_unit: ClassVar[bool] = True  # its labels are composite rewards' shares, in their unit
+    has_unit: ClassVar[bool] = True  # its labels are in a unit
+    unit_of_scores: ClassVar[bool] = True  # that of composite rewards per step
 
     def settings(self, **changes: Any) -> Settings:
         return builders.tiny(**{'method': self.method, 'delay': DELAY} | self.changes | changes)
@@ -139,7 +141,9 @@ class Contract:
     def test_raw_labels_are_the_scaled_ones_times_the_target_scale(self):
         memory = filled()
         scaled, raw = self.trained(memory), self.trained(memory, reward_unit='raw')
-        assert scaled.target_scale == raw.target_scale == memory.segments.score_scale()
+        assert scaled.target_scale == raw.target_scale
+        if self.unit_of_scores:
+            assert scaled.target_scale == memory.segments.score_scale()
         batch = batch_of(memory, scaled)
         factor = scaled.target_scale if self.has_unit else 1.0
         np.testing.assert_allclose(raw.label(batch), scaled.label(batch) * factor, rtol=1e-5)
@@ -394,6 +398,30 @@ class TestRandom(Contract):
             assert np.mean(weights > share) == pytest.approx((1 - share) ** 6, abs=0.02)
 
 
+class TestUniformOfSquares(TestUniform):
+    changes: ClassVar[dict[str, Any]] = {'composite': 'square_sum'}
+    unit_of_scores: ClassVar[bool] = False
+
+    @staticmethod
+    def expected(value: float, true: F32) -> F32:
+        return np.full(len(true), np.sign(value) * abs(value) ** 0.5 / len(true), np.float32)
+
+
+class TestUniformOfMaxima(TestUniform):
+    changes: ClassVar[dict[str, Any]] = {'composite': 'max'}
+    unit_of_scores: ClassVar[bool] = False
+
+    @staticmethod
+    def expected(value: float, true: F32) -> F32:
+        return np.full(len(true), value, np.float32)
+
+    def test_a_state_in_units_of_scores_is_refused(self):
+        made = self.trained(filled())
+        state = {'target_scale': made.state()['target_scale']}
+        with pytest.raises(RewardModelError, match="'uniform' refused.*composite = 'max'"):
+            made.load_state(state)
+
+
 class TestTrueReward(Rule):
     method = 'true'
 
@@ -416,6 +444,26 @@ class TestOnes(Rule):
     @staticmethod
     def expected(value: float, true: F32) -> F32:
         return np.ones_like(true)
+
+
+@pytest.mark.parametrize('kind', Composite.__args__)
+def test_methods_differ_in_how_they_distribute_rewards_and_not_in_their_size(kind):
+    """In units of scores per step the oracle had 13 times, or 0.02 times, the others' size."""
+    delay = 25
+    memory = planted.memory(
+        planted.progress, lambda r: float(composite(kind, r, 3.0, delay)), delay=delay, segments=80
+    )
+    sizes = {}
+    for method in ('uniform', 'true', 'evidence', 'mlp'):
+        changes = {'mlp__learning_rate': 0.01, 'mlp__hidden': (16,)}
+        settings = builders.tiny(method=method, delay=delay, composite=kind, **changes)
+        made = registry.make(settings, O, A)
+        made.prepare(memory)
+        Contract.train(made, memory, range(100 if method == 'mlp' else 0))
+        labels = made.label(batch_of(memory, made)).astype(np.float64)
+        sizes[method] = float(np.sqrt(np.mean(labels**2)))
+    assert sizes['uniform'] == pytest.approx(1, rel=1e-5)
+    assert all(1 / 3 < size < 3 for size in sizes.values()), sizes
 
 
 def test_a_method_that_does_not_exist_is_refused_by_name():

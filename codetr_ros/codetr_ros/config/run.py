@@ -134,7 +134,8 @@ class Settings(Schedule, Group):
     )
     reward_unit: Literal['scaled', 'raw'] = Field(
         'scaled',
-        description='step rewards for the learner: in units of c (decided here), or unscaled',
+        description='step rewards for the learner: in units of c, or of the level of scores for '
+        'methods whose labels are no shares of scores (decided here); or unscaled',
     )
     relabel_steps: int = Field(
         0,

@@ -1,9 +1,10 @@
 """Reward methods that learn nothing: the delayed reward as it is or spread, the truth, a constant.
 
-All of them state their rewards in the unit of the reward transformer (`target_scale`,
-`reward_unit`), so that results differ only by how rewards are distributed.
+Their rewards are of the size of those of learnt methods, so that results differ only by how
+rewards are distributed: the mean rewards of segments have the root mean square 1 when they are
+first measured (`target_scale`, `reward_unit`).
 
-The rules in a table: docs/methods.md#fixed-rules.
+The rules in a table: docs/methods.md#fixed-rules. The unit: docs/methods.md#scale.
 """
 
 import hashlib
@@ -12,11 +13,15 @@ from collections.abc import Mapping
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from codetr_ros.config import Settings
 from codetr_ros.memory.batches import SegmentBatch
+from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import F32, F64
 from codetr_ros.rewards.base import RewardMethod, RewardModelError, segment_steps
+from codetr_ros.rewards.evidence import links
+from codetr_ros.rewards.evidence.link import Sum, level_scale
 from codetr_ros.seeding import generator
 
 
@@ -48,13 +53,62 @@ class LastStep(Redistribution):
         return rewards
 
 
-class Uniform(Redistribution):
-    """The composite reward R of a segment of m steps spread evenly: R / m on each."""
+class StepReward(Redistribution):
+    """A rule whose rewards are in the unit of step rewards, whatever the kind of score.
+
+    The target scale is the root mean square level of the scores (`Link.level`): for sums it is
+    that of the scores per step, c. Were it c for others too, the oracle's rewards would be many
+    times as large as all others under a soft maximum, and vanish where scores are squares.
+    """
+
+    def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
+        super().__init__(settings, observation_size, action_size)
+        self._link = links.make(settings.composite, settings.beta, settings.delay)
+
+    def prepare(self, memory: Trajectories) -> None:
+        """Freeze the scale of levels, the first time."""
+        if not self.target_scale and not self._of_scores and self._settings.target_scale == 'rms':
+            ids, segments = memory.segments.ids(), memory.segments
+            levels = self._link.level(segments.scores(ids), segments.lengths(ids))
+            self.target_scale = level_scale(levels)
+        super().prepare(memory)
+
+    @property
+    def _of_scores(self) -> bool:
+        """Whether levels are scores per step, and their scale c."""
+        return isinstance(self._link, Sum)
+
+    def state(self) -> dict[str, Tensor]:
+        """The target scale, and where it was another one before, that it is that of levels."""
+        return super().state() | ({} if self._of_scores else {'of_levels': torch.tensor(1)})
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Go on from a `state()`.
+
+        Raises:
+            RewardModelError: it is another method's, or its unit is that of scores per step.
+        """
+        if not self._of_scores and state.keys() == {'target_scale'}:
+            raise RewardModelError(
+                f'state of method {self.name!r} refused: it has no of_levels. It was saved when '
+                f'rewards of composite = {self._settings.composite!r} were in units of scores per '
+                'step, no longer in that of their levels. Start the run again, or finish it with '
+                'the version that began it'
+            )
+        super().load_state(state)
+
+
+class Uniform(StepReward):
+    """The even spread: on each step the constant step reward that explains the segment's score.
+
+    For a sum R of m steps that is R / m.
+    """
 
     name = 'uniform'
 
     def _rule(self, batch: SegmentBatch, unit: float) -> F64:
-        rewards: F64 = (batch.values / (batch.lengths - batch.context) / unit)[:, None]
+        level = self._link.level(batch.values, batch.lengths - batch.context)
+        rewards: F64 = (level / unit)[:, None]
         return rewards
 
 
@@ -82,11 +136,11 @@ class Random(Redistribution):
             rewards[i, own] = value * weights / weights.sum()
         return rewards
 
-    def state(self) -> dict[str, torch.Tensor]:
+    def state(self) -> dict[str, Tensor]:
         """The seed of the weights, and the target scale."""
         return super().state() | {'seed': torch.tensor(self._seed, dtype=torch.int64)}
 
-    def load_state(self, state: Mapping[str, torch.Tensor]) -> None:
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Go on from a `state()`.
 
         Raises:
@@ -96,7 +150,7 @@ class Random(Redistribution):
         self._seed = int(state['seed'])
 
 
-class TrueReward(Redistribution):
+class TrueReward(StepReward):
     """The oracle: the environment's own step rewards. In process only; no node may see them."""
 
     name = 'true'
