@@ -3,10 +3,12 @@ import math
 from dataclasses import replace
 
 import pytest
+from rosbags.rosbag2 import StoragePlugin
 
 from codetr_ros.bags.info import Range, survey
 from codetr_ros.cli import main
 from codetr_ros.records import CompositeReward, RunSpec
+from helpers.arm import NOON, attempt, bag
 from helpers.bags import WRITERS, a_run, ours
 
 
@@ -27,6 +29,19 @@ def test_what_is_in_a_bag_is_counted(writer, tmp_path):
     }  # fmt: skip
     assert found['topics']['/run/transitions']['messages'] == 12
     assert found['faults'] == 0
+
+
+@pytest.mark.parametrize('storage', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_begin_and_duration_are_those_of_all_messages_whoever_wrote_them(
+    storage, tmp_path, capsys
+):
+    sent = attempt(40)
+    made = bag(tmp_path / 'bag', sorted(sent, key=lambda one: one.topic), storage)
+    found = survey(made)
+    assert (found['first_ns'], found['last_ns']) == (NOON, NOON + 800_000_000)
+    assert main(['bag', 'info', str(made)]) == 0
+    said = capsys.readouterr().out
+    assert '2023-11-14 22:13:20.000 UTC' in said and '0.800 s' in said
 
 
 def test_info_shows_tables_and_json(tmp_path, capsys):

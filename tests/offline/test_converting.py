@@ -296,6 +296,31 @@ def test_joints_are_found_by_name_whatever_their_order():
     assert mapping.numbers(joint_state(['a', 'b'], [1, 2]), empty) is None
 
 
+def test_joints_may_be_named_by_joint_names_as_in_a_trajectory():
+    values = mapping.Values(topic='/t', fields=('points[0].positions',), joints=('b', 'a'))
+    point = SimpleNamespace(positions=np.array([1.0, 2.0, 3.0]))
+    message = SimpleNamespace(joint_names=['a', 'x', 'b'], points=[point])
+    assert mapping.numbers(message, values).tolist() == [3, 1]
+    with pytest.raises(FitError, match='/t names no joints: there is neither `name` nor'):
+        mapping.numbers(SimpleNamespace(name='arm', points=[point]), values)
+
+
+def test_a_message_that_names_a_joint_twice_is_passed_over_with_a_count():
+    joints = [{'topic': '/state', 'fields': ['position'], 'joints': ['a']}]
+    converter = Converter(rules(observation=joints), 'run')
+    for names in (['a', 'b'], ['a', 'a'], ['b', 'b']):
+        list(converter.feed(said(1.0, '/state')._replace(message=joint_state(names, [1, 2]))))
+    assert converter.conversion.dropped == {
+        converting.JOINT_TWICE: 1,
+        converting.NO_JOINTS: 1,
+    }
+
+
+def test_a_topic_of_the_mapping_may_lack_its_leading_slash():
+    made = rules(action={'topic': 'command', 'fields': ['data']})
+    assert made.action.topic == '/command'
+
+
 def test_fields_are_reached_by_dots_and_indices():
     pose = SimpleNamespace(x=1.0, y=2.0)
     message = SimpleNamespace(poses=[pose, SimpleNamespace(x=3.0, y=4.0)], data=np.arange(3.0))
@@ -324,8 +349,8 @@ def test_a_field_that_does_not_exist_is_named_with_those_that_do(path, expected)
         ({'sampling': {'by': 'rate'}}, 'rate must be given if `by` is rate'),
         ({'score': {'topic': '/s', 'of': 'last_steps'}}, 'steps must be given if `of`'),
         (
-            {'action': {'topic': 'x', 'fields': ['data']}},
-            "action.topic = 'x': String should match",
+            {'action': {'topic': 'a b', 'fields': ['data']}},
+            "action.topic = 'a b': String should match",
         ),
         (
             {'action': {'topic': '/x', 'fields': ['data'], 'low': 2.0}},

@@ -36,6 +36,10 @@ class _Topic:
     def type(self) -> str:
         return self.channel.type
 
+    @property
+    def encoding(self) -> str:
+        return self.channel.encoding
+
     def digest(self) -> str:
         return self.channel.definition.digest
 

@@ -6,6 +6,7 @@ compared with this version's, field by field: bytes read by a wrong definition w
 numbers.
 """
 
+import re
 import struct
 from collections.abc import Callable
 from dataclasses import fields
@@ -27,6 +28,7 @@ from rosbags.typesys import (
 from rosbags.typesys.store import Typestore
 
 from codetr_ros.bags.errors import BagError
+from codetr_ros.bags.names import full_type_name
 from codetr_ros.records import Record, RecordError
 from codetr_ros.records.fields import RECORD_TYPES, record_of, type_name
 
@@ -36,6 +38,10 @@ LONGEST_DEFINITION = 1 << 20
 _TEXTS = Path(__file__).parent / 'msg'  # the files of the message package itself
 _TIME = {'builtin_interfaces/msg/Time': 'int32 sec\nuint32 nanosec'}
 _UNREADABLE = (SerdeError, IndexError, OverflowError)
+UNREADABLE = (SerdeError, TypesysError, LookupError, OverflowError, RecursionError)
+"""What decoding a message by a definition from a bag can raise."""
+_LINE = '=' * 80  # rosbag2 puts it, and a heading, before each definition but a .msg file's first
+_HEADING = re.compile(r'(MSG|IDL): *(\S+)\s*\n')
 
 
 class Definition(NamedTuple):
@@ -81,13 +87,26 @@ def parsed(name: str, definition: Definition) -> Typesdict:
             f'at most {LONGEST_DEFINITION} are read'
         )
     try:
-        types = (
-            get_types_from_msg(text, name) if encoding == 'ros2msg' else get_types_from_idl(text)
-        )
+        types = get_types_from_msg(text, name) if encoding == 'ros2msg' else _idl_types(text)
     except (TypesysError, ValueError, LookupError, RecursionError) as error:
         raise BagError(f'the definition of {name} cannot be read: {error}') from error
     if name not in types:
         raise BagError(f'the definition of {name} does not define it')
+    return types
+
+
+def _idl_types(text: str) -> Typesdict:
+    """The types of an IDL definition as rosbag2 writes it: each file of the type, and of the types
+    that it contains, behind a line of = and a heading, with its `#include` lines.
+    """
+    types: Typesdict = {}
+    for piece in re.split(rf'^{_LINE}=*\s*\n', text, flags=re.MULTILINE):
+        heading = _HEADING.match(piece)
+        body = piece[heading.end() :] if heading else piece
+        if heading and heading[1] == 'MSG':
+            types |= get_types_from_msg(body, full_type_name(heading[2]))
+        elif body.strip():
+            types |= get_types_from_idl(re.sub(r'^[ \t]*#.*$', '', body, flags=re.MULTILINE))
     return types
 
 
@@ -202,3 +221,26 @@ def encode(record: Record, stamp: int = 0) -> bytes:
         return bytes(store.serialize_cdr(store.types[name](*values), name))
     except (SerdeError, struct.error, OverflowError) as error:
         raise RecordError(f'{type(record).__name__} cannot be written: {error}') from error
+
+
+@cache
+def types_of(name: str, definition: Definition) -> Typestore:
+    """The types to decode a message by: as the bag defines them, or as ROS 2 Jazzy does where the
+    bag has no definition.
+
+    Raises:
+        BagError: the type is not known, or its definition cannot be used.
+    """
+    if not definition.encoding:
+        store = get_typestore(Stores.ROS2_JAZZY)
+        if name not in store.fielddefs:
+            raise BagError(f'the bag has no definition of {name}, and ROS 2 Jazzy has none')
+        return store
+    types = parsed(name, definition)
+    store = get_typestore(Stores.EMPTY)
+    try:
+        store.register(types)
+        store.get_msgdef(name)
+    except UNREADABLE as error:
+        raise BagError(f'the definition of {name} cannot be used: {error}') from error
+    return store

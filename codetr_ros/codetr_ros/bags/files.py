@@ -5,6 +5,7 @@ import re
 import stat
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path, PurePath
 
 import yaml
@@ -13,6 +14,7 @@ from codetr_ros.bags import metadata
 from codetr_ros.bags.errors import BagError, Damage, Place
 from codetr_ros.bags.metadata import METADATA
 
+_LFS_POINTER = b'version https://git-lfs'
 STORAGES = ('.mcap', '.db3')
 COMPRESSED = '.zstd'
 """The further suffix of a file that is compressed as a whole."""
@@ -37,6 +39,7 @@ def listed_files(folder: Path) -> list[str]:
     """
     path = folder / METADATA
     try:
+        _check_no_pointer(path)
         paths = metadata.read(folder)['relative_file_paths']
         return [PurePath(name).name for name in paths]
     except FileNotFoundError:
@@ -62,6 +65,7 @@ def bag_files(path: Path, on_damage: Callable[[Damage], None] | None) -> list[Pa
         if stat.S_ISREG(mode):
             if storage_of(path.name) not in STORAGES:
                 raise BagError(f'{path} is no bag: a bag is a folder, or a file of {_named()}')
+            _check_no_pointer(path)
             return [path]
         if not stat.S_ISDIR(mode):
             raise BagError(f'{path} is neither file nor folder')
@@ -132,3 +136,20 @@ def _check_file(path: Path) -> None:
             raise BagError(f'{path} is no file')
     except OSError as error:
         raise BagError(f'{path} cannot be read: {error.strerror}') from error
+    with suppress(OSError):  # of the disk: reported where the file is read
+        _check_no_pointer(path)
+
+
+def _check_no_pointer(path: Path) -> None:
+    """Refuse what Git leaves in place of a large file.
+
+    Raises:
+        BagError: it is such a pointer.
+        OSError: the file cannot be read.
+    """
+    with path.open('rb') as file:
+        if file.read(len(_LFS_POINTER)) == _LFS_POINTER:
+            raise BagError(
+                f'{path} is a Git LFS pointer, not the file itself: run `git lfs pull` in its '
+                'repository'
+            )

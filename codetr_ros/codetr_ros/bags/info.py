@@ -173,17 +173,20 @@ def survey(path: Path | str) -> dict[str, Any]:
 
     bag = Bag(path, damaged)
     runs: dict[tuple[str, str], RunCounts] = {}
-    times = Range()
-    for entry in bag.entries():
-        key = namespace_of(entry), entry.record.run_id
-        runs.setdefault(key, RunCounts(*key)).take(entry.record)
-        times.add(entry.log_time)
+    first = last = None
+    for raw in bag.raw():
+        first = raw.log_time if first is None else min(first, raw.log_time)
+        last = raw.log_time if last is None else max(last, raw.log_time)
+        entry = bag.entry(raw)
+        if entry is not None:
+            key = namespace_of(entry), entry.record.run_id
+            runs.setdefault(key, RunCounts(*key)).take(entry.record)
     return {
         'bag': str(bag.path),
         'files': [{'name': file.name, 'bytes': file.stat().st_size} for file in bag.files],
         'bytes': sum(file.stat().st_size for file in bag.files),
-        'first_ns': times.low if times.count else None,
-        'last_ns': times.high if times.count else None,
+        'first_ns': first,
+        'last_ns': last,
         'topics': {
             name: {'type': topic.type, 'messages': topic.count, 'bytes': topic.bytes}
             for name, topic in bag.topics.items()

@@ -52,12 +52,6 @@ class FaultError(Exception):
     """Something in the file is not as it must be."""
 
 
-def full_type_name(name: str) -> str:
-    """`package/msg/Name`, where some writers have `package/Name`."""
-    package, _, rest = name.partition('/')
-    return name if '/' in rest else f'{package}/msg/{rest}'
-
-
 def parse_record(kind: Any, content: bytes | memoryview) -> Any:
     """A record of the file's structure from its bytes.
 

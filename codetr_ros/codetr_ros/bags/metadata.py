@@ -9,6 +9,8 @@ from typing import Any, Protocol
 
 import yaml
 
+from codetr_ros.bags.names import full_name, full_type_name
+
 METADATA = 'metadata.yaml'
 VERSION = 9
 """Version of the file's layout, as rosbag2 of Jazzy writes it."""
@@ -51,6 +53,10 @@ class DescribedTopic(Protocol):
     @property
     def type(self) -> str:
         """Such as `sensor_msgs/msg/JointState`."""
+
+    @property
+    def encoding(self) -> str:
+        """The serialisation of its messages, such as `cdr`."""
 
     def qos(self) -> list[dict[str, Any]]:
         """The QoS it was offered with."""
@@ -102,7 +108,7 @@ def render(files: Sequence[BagFile], topics: Iterable[DescribedTopic]) -> str:
                 'topic_metadata': {
                     'name': topic.name,
                     'type': topic.type,
-                    'serialization_format': 'cdr',
+                    'serialization_format': topic.encoding,
                     'offered_qos_profiles': topic.qos(),
                     'type_description_hash': topic.digest(),
                 },
@@ -129,13 +135,13 @@ def render(files: Sequence[BagFile], topics: Iterable[DescribedTopic]) -> str:
 
 
 def check(
-    folder: Path, topics: Mapping[str, tuple[str, int]], files: Mapping[str, int]
+    folder: Path, topics: Mapping[str, tuple[str, int, str]], files: Mapping[str, int]
 ) -> Iterator[str]:
     """Compare a bag's `metadata.yaml` with the bag.
 
     Args:
         folder: the bag.
-        topics: type and number of messages of each topic that was read.
+        topics: type, number of messages and serialisation of each topic that was read.
         files: messages in each file, by its name.
 
     Yields:
@@ -160,7 +166,9 @@ def check(
 
 
 def _contradictions(
-    content: Mapping[str, Any], topics: Mapping[str, tuple[str, int]], files: Mapping[str, int]
+    content: Mapping[str, Any],
+    topics: Mapping[str, tuple[str, int, str]],
+    files: Mapping[str, int],
 ) -> Iterator[str]:
     if not 1 <= int(content['version']) <= VERSION:
         yield f'{METADATA} is of version {content["version"]}, only 1 to {VERSION} are known'
@@ -182,10 +190,17 @@ def _contradictions(
             )
     described = {}
     for topic in content['topics_with_message_count']:
-        kind = topic['topic_metadata']['type']
-        described[topic['topic_metadata']['name']] = kind, topic['message_count']
+        kind = full_type_name(topic['topic_metadata']['type'])
+        name = full_name(topic['topic_metadata']['name'])
+        described[name] = kind, topic['message_count']
+        stated = topic['topic_metadata'].get('serialization_format', '')
+        if name in topics and stated != topics[name][2]:
+            yield (
+                f'{METADATA} states that {name} is serialised as {stated!r}, its file states '
+                f'{topics[name][2]!r}'
+            )
     for name in sorted(described.keys() | topics.keys()):
-        kind, count = topics.get(name, ('', 0))
+        kind, count, _ = topics.get(name, ('', 0, ''))
         stated_kind, stated_count = described.get(name, ('', 0))
         if count != stated_count or (kind and stated_kind and kind != stated_kind):
             yield (

@@ -14,9 +14,9 @@ LIBRARY = 'codetr_ros'
 class Channel(NamedTuple):
     """A topic of a bag."""
 
-    topic: str  # full name
+    topic: str  # as the bag has it; `full_name` has the leading slash
     type: str  # such as codetr_msgs/msg/Transitions
-    encoding: str  # of the messages: 'cdr'
+    encoding: str  # of the messages, as declared: 'cdr' is the one that is read
     definition: Definition
     qos: str  # as YAML text, as the bag has it; may be empty
     numbered: bool = False  # its messages are numbered 0, 1, 2, ...: our recorder wrote them

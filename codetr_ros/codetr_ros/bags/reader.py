@@ -6,33 +6,27 @@ every chunk's CRC is checked, every definition compared, and the first fault is 
 the caller asks to receive faults and to go on (`on_damage`).
 """
 
-import tempfile
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Collection, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import zstandard
-from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, TypesysError, get_typestore
-from rosbags.typesys.store import Typestore
 
-from codetr_ros.bags.definitions import Definition, check_own, decode, parsed
+from codetr_ros.bags.definitions import UNREADABLE, check_own, decode, types_of
 from codetr_ros.bags.errors import BagError, Damage, Place
-from codetr_ros.bags.files import COMPRESSED, bag_files
-from codetr_ros.bags.mcap_file import McapFile
+from codetr_ros.bags.files import bag_files
 from codetr_ros.bags.mcap_layout import LARGEST_RECORD, unzstd
-from codetr_ros.bags.raw import OnDamage, RawMessage
-from codetr_ros.bags.sqlite_file import SqliteFile
+from codetr_ros.bags.names import full_name
+from codetr_ros.bags.opening import open_file, report
+from codetr_ros.bags.raw import Channel, OnDamage, RawMessage
 from codetr_ros.records import Record, RecordError
 from codetr_ros.records.fields import RECORD_TYPES, type_name
 
-_KINDS: dict[str, type[McapFile | SqliteFile]] = {'.mcap': McapFile, '.db3': SqliteFile}
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'  # no CDR message begins with these bytes
-_UNREADABLE = (SerdeError, TypesysError, LookupError, OverflowError, RecursionError)
+_CDR = ('cdr', '')  # '': the file does not declare how its messages are serialised
 
 
 class Entry(NamedTuple):
@@ -65,6 +59,7 @@ class Topic:
     type: str
     count: int
     bytes: int  # of all its messages, uncompressed
+    encoding: str  # of its messages, as declared
 
 
 class Bag:
@@ -124,6 +119,7 @@ class Bag:
         kind = RECORD_TYPES.get(raw.channel.type)
         if kind is None:
             return None
+        _check_encoding(raw)
         try:
             check_own(raw.channel.type, raw.channel.definition)
         except BagError as error:
@@ -133,7 +129,8 @@ class Bag:
         except RecordError as error:
             self._damaged(raw, str(error))
             return None
-        return Entry(kind, record, raw.channel.topic, raw.log_time, raw.publish_time, raw.place)
+        topic = full_name(raw.channel.topic)
+        return Entry(kind, record, topic, raw.log_time, raw.publish_time, raw.place)
 
     def messages(
         self, topics: Collection[str] = (), types: Collection[str] = ()
@@ -142,28 +139,28 @@ class Bag:
         where it has none), in file order.
 
         Args:
-            topics: full names, such as `/joint_states`.
+            topics: such as `/joint_states`, with or without the leading slash.
             types: such as `sensor_msgs/msg/JointState`. All messages if neither is given.
 
         Raises:
             BagError: the bag is damaged, or a message's definition is not known.
         """
+        wanted = {full_name(topic) for topic in topics}
         for raw in self.raw():
-            channel = raw.channel
-            if (topics or types) and channel.topic not in topics and channel.type not in types:
+            channel, topic = raw.channel, full_name(raw.channel.topic)
+            if (topics or types) and topic not in wanted and channel.type not in types:
                 continue
+            _check_encoding(raw)
             try:
-                store = _typestore(channel.type, channel.definition)
+                store = types_of(channel.type, channel.definition)
             except BagError as error:
                 raise BagError(f'{raw.place}: {error}') from None
             try:
                 message = store.deserialize_cdr(raw.data, channel.type)
-            except _UNREADABLE as error:
+            except UNREADABLE as error:
                 self._damaged(raw, f'{channel.type} cannot be decoded: {error}')
                 continue
-            yield Message(
-                channel.type, message, channel.topic, raw.log_time, raw.publish_time, raw.place
-            )
+            yield Message(channel.type, message, topic, raw.log_time, raw.publish_time, raw.place)
 
     def raw(self) -> Iterator[RawMessage]:
         """Every message as bytes, in file order.
@@ -171,7 +168,7 @@ class Bag:
         Raises:
             BagError: the bag is damaged.
         """
-        types: dict[str, str] = {}
+        channels: dict[str, Channel] = {}
         counts: Counter[str] = Counter()
         sizes: Counter[str] = Counter()
         self.in_files, self.unchecked = {}, 0
@@ -181,15 +178,16 @@ class Bag:
                 for packed in opened.messages():
                     message = self._unpacked(packed)
                     if message is not None:
-                        sizes[message.channel.topic] += len(message.data)
+                        sizes[full_name(message.channel.topic)] += len(message.data)
                         yield message
-                counts += opened.counts
+                for topic, count in opened.counts.items():
+                    counts[full_name(topic)] += count
                 self.in_files[path.name] = opened.counts.total()
                 self.unchecked += opened.unchecked
-                types |= {channel.topic: channel.type for channel in opened.channels()}
+                channels |= {full_name(one.topic): one for one in opened.channels()}
         self._topics = {
-            name: Topic(name, kind, counts[name], sizes[name])
-            for name, kind in sorted(types.items())
+            name: Topic(name, channel.type, counts[name], sizes[name], channel.encoding)
+            for name, channel in sorted(channels.items())
         }
 
     def _unpacked(self, message: RawMessage) -> RawMessage | None:
@@ -229,63 +227,15 @@ class Bag:
 
     def _damaged(self, message: RawMessage, text: str) -> None:
         damage = Damage(message.place, f'{message.channel.topic}: {text}', len(message.data))
-        _report(damage, self.on_damage)
+        report(damage, self.on_damage)
 
 
-def _report(damage: Damage, on_damage: OnDamage | None) -> None:
-    if on_damage is None:
-        raise damage.error()
-    on_damage(damage)
-
-
-def open_file(
-    path: Path, stack: ExitStack, on_damage: OnDamage | None = None, thorough: bool = False
-) -> McapFile | SqliteFile:
-    """One file of a bag; a compressed one is first unpacked beside other temporary files, until
-    the stack is closed.
-
-    Raises:
-        BagError: it cannot be read or unpacked.
-    """
-    if path.suffix != COMPRESSED:
-        return _KINDS[path.suffix](path, on_damage, thorough=thorough)
-    folder = stack.enter_context(tempfile.TemporaryDirectory(prefix='codetr-bag-'))
-    unpacked = Path(folder) / path.stem
-    try:
-        with path.open('rb') as packed:
-            _write(zstandard.ZstdDecompressor().read_to_iter(packed), unpacked)
-    except zstandard.ZstdError as error:
-        _report(Damage(Place(path, 0), f'its zstd data is damaged ({error})', 0), on_damage)
-    except OSError as error:
-        text = f'cannot be read: {error.strerror}'
-        _report(Damage(Place(path, 0), text, 0, unread=True), on_damage)
-    return _KINDS[unpacked.suffix](unpacked, on_damage, path, thorough)
-
-
-def _write(pieces: Iterable[bytes], path: Path) -> None:
-    """Write what is read to a file.
-
-    Raises:
-        BagError: it cannot be written; errors of what is read pass through.
-    """
-    with _writing(path):
-        file = path.open('wb')
-    with file:
-        for piece in pieces:
-            with _writing(path):
-                file.write(piece)
-                file.flush()
-
-
-@contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
+def _check_encoding(raw: RawMessage) -> None:
+    if raw.channel.encoding not in _CDR:
         raise BagError(
-            f'{path}, to which a bag is unpacked, cannot be written: {error.strerror}: make room '
-            'there, or set TMPDIR to a folder that has some'
-        ) from error
+            f'{raw.place}: the messages of {raw.channel.topic} are serialised as '
+            f'{raw.channel.encoding!r}: only cdr is read. Convert the bag to cdr first'
+        )
 
 
 def _decompressed(data: bytes | memoryview) -> bytes:
@@ -293,20 +243,3 @@ def _decompressed(data: bytes | memoryview) -> bytes:
     if len(unpacked) > LARGEST_RECORD:
         raise zstandard.ZstdError(f'more than {LARGEST_RECORD} bytes')
     return unpacked
-
-
-@cache
-def _typestore(name: str, definition: Definition) -> Typestore:
-    if not definition.encoding:
-        store = get_typestore(Stores.ROS2_JAZZY)
-        if name not in store.fielddefs:
-            raise BagError(f'the bag has no definition of {name}, and ROS 2 Jazzy has none')
-        return store
-    types = parsed(name, definition)
-    store = get_typestore(Stores.EMPTY)
-    try:
-        store.register(types)
-        store.get_msgdef(name)
-    except _UNREADABLE as error:
-        raise BagError(f'the definition of {name} cannot be used: {error}') from error
-    return store

@@ -12,6 +12,7 @@ from urllib.parse import quote
 from codetr_ros.bags.definitions import Definition
 from codetr_ros.bags.errors import Damage, Place
 from codetr_ros.bags.mcap_layout import LARGEST_RECORD
+from codetr_ros.bags.names import full_type_name
 from codetr_ros.bags.raw import Channel, OnDamage, RawMessage
 
 _DAMAGED = (sqlite3.Error, UnicodeDecodeError, OverflowError)
@@ -199,5 +200,5 @@ def _channels(connection: sqlite3.Connection) -> dict[int, Channel]:
             raise sqlite3.DatabaseError(f'the row of topic {texts[0]!r} is damaged')
         topic, kind, encoding, qos, digest = texts
         definition = Definition(*definitions.get(kind, ('', '')), digest)
-        channels[number] = Channel(topic, kind, encoding, definition, qos)
+        channels[number] = Channel(topic, full_type_name(kind), encoding, definition, qos)
     return channels

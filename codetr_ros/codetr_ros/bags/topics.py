@@ -22,6 +22,7 @@ class BagTopic:
     type: str  # such as codetr_msgs/msg/Transitions
     depth: int
     transient_local: bool
+    encoding: str = 'cdr'
 
     def qos(self) -> list[dict[str, Any]]:
         """The QoS it was offered with, as rosbag2 writes it (so that `ros2 bag play` offers the

@@ -116,7 +116,9 @@ def verify(path: Path | str) -> Verdict:
     for run in runs.values():
         run.finish(bag.path)
     if bag.path.is_dir():
-        topics = {name: (topic.type, topic.count) for name, topic in bag.topics.items()}
+        topics = {
+            name: (topic.type, topic.count, topic.encoding) for name, topic in bag.topics.items()
+        }
         for text in metadata.check(bag.path, topics, bag.in_files):
             findings.add('metadata', bag.path, text)
     if bag.unchecked:

@@ -77,8 +77,10 @@ def _bag(contents: Mapping[str, Any]) -> Table:
         table.add_row('file', f'{file["name"]}, {file["bytes"] / 1e6:.2f} MB')
     first, last = contents['first_ns'], contents['last_ns']
     if first is not None:
-        began = datetime.fromtimestamp(first / 1e9, timezone.utc)
-        table.add_row('recorded', f'{began:%Y-%m-%d %H:%M:%S} UTC, {(last - first) / 1e9:.1f} s')
+        for name, time in (('begin', first), ('end', last)):
+            date = datetime.fromtimestamp(time // 10**9, timezone.utc)
+            table.add_row(name, f'{date:%Y-%m-%d %H:%M:%S}.{time // 10**6 % 1000:03} UTC')
+        table.add_row('duration', f'{(last - first) / 1e9:.3f} s')
     return table
 
 

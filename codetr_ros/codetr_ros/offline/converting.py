@@ -35,6 +35,7 @@ NOT_FINITE = 'samples that are not finite'
 NO_NEXT = 'last steps of episodes without an observation after them'
 CLIPPED = 'commands beyond low or high, clipped'
 NO_JOINTS = 'messages without all of the joints'
+JOINT_TWICE = 'messages that name one of the joints twice'
 BACKWARDS = 'messages received earlier than the one before, taken as simultaneous'
 
 
@@ -113,7 +114,8 @@ class Converter:
     def _numbers(self, message: Message, values: mapping.Values) -> F64 | None:
         array = mapping.numbers(message.message, values)
         if array is None:
-            self.conversion.dropped[NO_JOINTS] += 1
+            twice = mapping.names_a_joint_twice(message.message, values)
+            self.conversion.dropped[JOINT_TWICE if twice else NO_JOINTS] += 1
         return array
 
     def _ends(self, message: Message) -> bool:

@@ -7,13 +7,14 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
+from codetr_ros.bags.names import full_name
 from codetr_ros.config import Group, SettingsError, validate
 from codetr_ros.offline.errors import FitError
 from codetr_ros.records import F64
 
-Topic = Annotated[str, Field(pattern=r'^/\S+$')]
+Topic = Annotated[str, Field(pattern=r'^/?[^\s/]\S*$'), AfterValidator(full_name)]
 Path_ = Annotated[str, Field(pattern=r'^[A-Za-z_]\w*(\[\d+\])?(\.[A-Za-z_]\w*(\[\d+\])?)*$')]
 
 
@@ -30,7 +31,8 @@ class Values(Group):
         None,
         min_length=1,
         description='take only the elements of these joints from array fields, in this order, by '
-        'the field `name` of the message (sensor_msgs/JointState)',
+        'the field `name` of the message (sensor_msgs/JointState), or else by `joint_names` '
+        '(trajectory_msgs/JointTrajectory)',
     )
 
 
@@ -179,16 +181,40 @@ def field(message: Any, path: str, topic: str) -> Any:
     return value
 
 
+def joint_names(message: Any, topic: str) -> list[str]:
+    """The names of the joints that the arrays of a message are of.
+
+    Raises:
+        FitError: it has none.
+    """
+    for name in ('name', 'joint_names'):
+        names = getattr(message, name, None)
+        if isinstance(names, (list, tuple)):
+            return list(names)
+    there = [name for name in getattr(message, '__dict__', ()) if not name.startswith('_')]
+    raise FitError(
+        f'{topic} names no joints: there is neither `name` nor `joint_names` in '
+        + (', '.join(there) or type(message).__name__)
+        + '. Leave out `joints`, and name elements such as data[0]'
+    )
+
+
+def names_a_joint_twice(message: Any, values: Values) -> bool:
+    """Whether a message names one of the joints of the mapping more than once."""
+    names = joint_names(message, values.topic) if values.joints else []
+    return any(names.count(joint) > 1 for joint in values.joints or ())
+
+
 def numbers(message: Any, values: Values) -> F64 | None:
-    """The numbers of a message, in order; None if a joint is missing.
+    """The numbers of a message, in order; None if a joint is missing, or named twice.
 
     Raises:
         FitError: a field does not exist or holds no numbers.
     """
     rows: list[int] | None = None
     if values.joints is not None:
-        names = list(field(message, 'name', values.topic))
-        if any(joint not in names for joint in values.joints):
+        names = joint_names(message, values.topic)
+        if any(names.count(joint) != 1 for joint in values.joints):
             return None
         rows = [names.index(joint) for joint in values.joints]
     arrays = []
