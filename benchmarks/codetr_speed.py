@@ -174,7 +174,7 @@ def measure(options: tuple[Any, ...], rounds: int, device: str) -> list[dict[str
     sequence.DEVICE_PART_BYTES = part_mib << 20
     changes: dict[str, Any] = {'delay': delay, 'threads': threads, 'codetr.precision': precision}
     changes |= {'reward_device': device, 'codetr.label_batch': label_batch}
-    work = Work(load('paper').changed(changes))
+    work = Work(load('paper').changed({'codetr.context': 'segment'} | changes))
     where = work.model.device
     tasks: dict[str, tuple[Callable[[], tuple[int, int]], int]] = {
         'gradient': (work.gradient, 1),

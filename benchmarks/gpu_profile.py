@@ -52,6 +52,7 @@ def host(device: str, smallest: bool) -> str:
 def kernels(device: str, smallest: bool, precision: str) -> str:
     """The kernels of a gradient step and of labelling."""
     changes = {'reward_device': device, 'codetr.precision': precision, 'delay': 25}
+    changes['codetr.context'] = 'segment'
     changes |= {'codetr.layers': 1, 'codetr.embedding': 16} if smallest else {}
     work = Work(load('paper').changed(changes | {'codetr.label_batch': 4096}))
     work.ids = work.ids[:4000]

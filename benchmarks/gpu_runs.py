@@ -92,6 +92,7 @@ def variants(device: str) -> list[Variant]:
 def settings_of(variant: Variant, smallest: bool) -> Settings:
     """The settings of a run."""
     usual = {'task': 'HalfCheetah-v5', 'warmup_steps': 1000, 'sac.compile': False}
+    usual |= {'codetr.context': 'segment'}
     changes = usual | {'codetr.first_gradient_steps': 10, **variant.changes}
     if smallest:
         changes |= {**SMALL, 'steps': 300, 'warmup_steps': 100, 'sac.compile': False}

@@ -38,6 +38,7 @@ def test_the_papers_table_is_what_the_paper_preset_says() -> None:
     assert (paper.codetr.layers, paper.codetr.heads, paper.codetr.embedding) == (3, 4, 256)
     assert (paper.codetr.batch, paper.codetr.learning_rate) == (64, 5e-5)
     assert (paper.codetr.weight_decay, paper.codetr.dropout) == (1e-4, 0.1)
+    assert (paper.codetr.window, paper.codetr.context) == (100, 'window')
     assert (paper.codetr.first_gradient_steps, paper.codetr.gradient_steps) == (100, 10)
     assert (paper.warmup_steps, paper.steps, paper.evaluate_every) == (10_000, 1_000_000, 5000)
     assert (paper.sac.hidden, paper.sac.batch) == ((256, 256), 256)

@@ -207,6 +207,21 @@ def test_another_segment_is_invisible_without_context_and_visible_with_it(contex
     assert same == (context == 'segment')
 
 
+@pytest.mark.parametrize(('window', 'before'), [(10, 4), (DELAY, 0), (3, 0), (18, 12)])
+def test_a_window_is_filled_up_with_the_steps_before_the_segment(window, before):
+    """Its length is H, or the segment's where that is longer, or what the episode has."""
+    data = memory(lengths=(30,))
+    made = model(data, context='window', window=window)
+    batch = whole(data, made.context)
+    assert batch.context.tolist() == [min(before, DELAY * i) for i in range(5)]
+    assert batch.lengths.max() == max(window, DELAY)
+    plain = made.label(batch)
+    last = np.concatenate([part[-DELAY:] for part in made.label_passes(data, np.array([4]))])
+    np.testing.assert_allclose(last, plain[4, batch.context[4] : batch.lengths[4]], rtol=1e-5)
+    alone = model(data, context='segment', window=window).label(whole(data))
+    assert np.allclose(alone[4], last) == (before == 0)
+
+
 @pytest.mark.parametrize('scope', ['segment', 'window'])
 def test_the_scope_decides_whether_the_context_takes_part_in_the_weights(scope):
     data = memory()

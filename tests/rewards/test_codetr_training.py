@@ -108,6 +108,17 @@ def test_the_learning_rate_rises_then_stays_or_falls_to_a_tenth():
     )
 
 
+def test_a_peaked_learning_rate_begins_and_ends_at_the_setting_and_peaks_at_ten_times_it():
+    """As optax's warmup_cosine_decay_schedule(rate, 10 rate, warm-up, total, rate) has it."""
+    config = settings(
+        warmup_gradient_steps=10, total_gradient_steps=110, learning_rate=1e-2, schedule='peaked'
+    ).codetr
+    rising = [1e-2 + (1e-1 - 1e-2) * step / 10 for step in range(10)]
+    falling = [1e-2 + (1e-1 - 1e-2) * math.cos(math.pi * step / 200) ** 2 for step in range(101)]
+    expected = [*rising, *falling, 1e-2, 1e-2]
+    assert [learning_rate(config, step) for step in range(113)] == pytest.approx(expected)
+
+
 def test_observations_are_standardised_by_moments_that_stay_as_they_were_at_the_warm_up():
     data = memory(lengths=(60,) * 4)
     made = model(data)

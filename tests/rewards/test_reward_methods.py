@@ -262,7 +262,12 @@ class TestCodetr(LearnedContract):
 
 
 class TestCodetrAsInThePaper(TestCodetr):
-    changes: ClassVar[dict[str, Any]] = {'codetr__tokens': 'pair', 'codetr__schedule': 'cosine'}
+    changes: ClassVar[dict[str, Any]] = {
+        'codetr__tokens': 'pair',
+        'codetr__schedule': 'peaked',
+        'codetr__context': 'window',
+        'codetr__window': 10,
+    }
 
 
 class TestCodetrWithContext(TestCodetr):

@@ -76,8 +76,12 @@ DIFFERENCES = (
     'anything learns from them; the paper does not mention it. Exceptions: ircr scales them to '
     'between 0 and 1, and lirpg divides by a running deviation.',
     'The paper does not state which step reward CoDeTr stores (the weighted one here), the scale '
-    'of its attention logits, its context or its initial weights: see the settings and '
-    'config/presets.',
+    'of its attention logits or its initial weights: see the settings and config/presets.',
+    'H = 100, "the sequence length used for prediction": here a segment with the steps before it '
+    'makes a sequence of 100 steps, in training too, and its steps are labelled in one pass. '
+    'Published code of this family reads the last step of a window of 100 steps for each step.',
+    'Learning rate: the one of Table 1 is the first and the last one, and the peak is ten times '
+    'that, as in published code of this family; the paper names rate, warm-up and total only.',
     'All methods and SAC were written anew from their papers; the docstring of each module lists '
     'its differences from published code.',
     'A last segment that an early end cuts short is scored like any other; the paper is silent.',

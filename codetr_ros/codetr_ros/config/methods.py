@@ -26,15 +26,17 @@ class CodetrSettings(Group):
     warmup_gradient_steps: int = Field(
         100, ge=0, le=10**7, description='gradient steps of linear learning-rate warm-up'
     )
-    schedule: Literal['constant', 'cosine'] = Field(
-        'cosine',
-        description='learning rate after its warm-up (decided here; not in the supplement)',
+    schedule: Literal['constant', 'cosine', 'peaked'] = Field(
+        'peaked',
+        description='after its warm-up from 0 the learning rate stays (constant), or falls to a '
+        'tenth (cosine). Or it begins and ends at its value and peaks at ten times that after the '
+        'warm-up (peaked), as in the published code of this family; the supplement is silent',
     )
     total_gradient_steps: int = Field(
         10_000,
         ge=1,
         le=10**9,
-        description='gradient steps after which the cosine schedule has decayed to a tenth',
+        description='gradient steps after which the schedules cosine and peaked have fallen',
     )
     first_gradient_steps: int = Field(
         100, ge=0, le=10**6, description='gradient steps after the last warm-up phase'
@@ -65,10 +67,11 @@ class CodetrSettings(Group):
         'segment',
         description='what in-sequence attention sees: the segment, or also the context before it',
     )
-    context: Literal['segment', 'episode'] = Field(
-        'segment',
-        description='start of the causal transformer: at the segment, or up to `window` steps '
-        'before it',
+    context: Literal['segment', 'window', 'episode'] = Field(
+        'window',
+        description='start of the causal transformer, in training and labelling: at the segment; '
+        'as many steps of the episode before it as make `window` steps with it; or up to `window` '
+        'steps before it',
     )
     label: Literal['product', 'rhat'] = Field(
         'product',

@@ -25,14 +25,18 @@ class Codetr(SequenceMethod):
 
     The switches of `CodetrSettings`, beyond their descriptions:
 
-    * `context` 'episode' puts up to `window` steps before the segment, in training and in
-      labelling; the loss and the labels are the segment's own in any case.
+    * `context` puts steps of the episode before the segment, in training and in labelling; the
+      loss and the labels are the segment's own in any case. With 'window' all of them make up to
+      `window` steps. That is our reading of the supplement's "sequence length used for
+      prediction", H = 100. Its windows end with segments: with n = 25, steps see the 75 to 99
+      steps before them, and one pass labels n steps.
     * `attention_scope` 'window' lets all steps of the window attend to all. The weights of the
       window's steps then sum to their number, and those of the segment to its share of that.
     * `labelling` 'window' takes the last `window` steps, in the segment or not, and keeps only the
       output of the last step. With `label` 'rhat' that is what Preference Transformer does; with
-      'product' the weight of the step is its weight within that window. If `context` is 'segment',
-      places beyond the delay occur in labelling only, untrained.
+      'product' the weight of the step is its weight within that window. All steps see `window`-1
+      steps before them, at the cost of a pass for each. If `context` is 'segment', places beyond
+      the delay occur in labelling only, untrained.
 
     Args:
         settings: the run's settings; the initial weights depend on its seed.
@@ -45,11 +49,16 @@ class Codetr(SequenceMethod):
 
     def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
         codetr = settings.codetr
+        before = {
+            'segment': 0,
+            'window': max(0, codetr.window - settings.delay),
+            'episode': codetr.window,
+        }
         super().__init__(
             settings,
             observation_size,
             action_size,
-            context=codetr.window if codetr.context == 'episode' else 0,
+            context=before[codetr.context],
             whole_window=codetr.attention_scope == 'window',
         )
 

@@ -32,6 +32,9 @@ With an eighth of it an H200 labels 0.84 times as many steps a second (gpu_check
 PART_WINDOWS = 65_535
 """The most windows at a time: as many sequences as CUDA's kernels for attention take."""
 
+PEAK = 10
+"""By how much the highest learning rate exceeds the last one, where it falls."""
+
 
 class SequenceMethod(Learned):
     """A transformer that sees a segment with up to `context` steps of its episode before it.
@@ -178,11 +181,19 @@ def learning_rate(settings: CodetrSettings, step: int) -> float:
 
     It rises linearly over `warmup_gradient_steps`, the last of which has the full rate, then stays
     there or falls on a half cosine to a tenth of it at `total_gradient_steps`, where it remains.
+
+    The schedule 'peaked' of the published code of this family, to which the supplement's rate is
+    the first and the last one, is ten times that: it rises from a tenth of its peak.
+
+    In words: docs/methods.md#codetr.
     """
     warmup = settings.warmup_gradient_steps
+    peak = settings.learning_rate * (PEAK if settings.schedule == 'peaked' else 1)
+    if step < warmup and settings.schedule == 'peaked':
+        return settings.learning_rate * (1 + (PEAK - 1) * step / warmup)
     if step < warmup:
-        return settings.learning_rate * (step + 1) / warmup
+        return peak * (step + 1) / warmup
     if settings.schedule == 'constant':
-        return settings.learning_rate
+        return peak
     progress = min(1.0, (step - warmup) / max(1, settings.total_gradient_steps - warmup))
-    return settings.learning_rate * (0.1 + 0.9 * 0.5 * (1 + math.cos(math.pi * progress)))
+    return peak * (1 / PEAK + (1 - 1 / PEAK) * 0.5 * (1 + math.cos(math.pi * progress)))
