@@ -28,6 +28,7 @@ CASES = [
     (REACHER, 'mlp', 'lock-step'),
     (PENDULUM, 'uniform', 'overlap'),
     (REACHER, 'random', 'lock-step'),
+    (PENDULUM, 'lrr', 'lock-step'),
     (REACHER, 'evidence', 'lock-step'),
     (PENDULUM, 'evidence', 'overlap'),
 ]

@@ -306,6 +306,14 @@ class TestRrdUnbiased(TestRrd):
     changes: ClassVar[dict[str, Any]] = {'rrd__loss': 'unbiased'}
 
 
+class TestLrr(PerceptronContract):
+    method = 'lrr'
+
+
+class TestLrrOfIndependentSteps(TestLrr):
+    changes: ClassVar[dict[str, Any]] = {'lrr__correlation': 'none'}
+
+
 class TestMlp(PerceptronContract):
     method = 'mlp'
 

@@ -174,6 +174,32 @@ class RrdSettings(PerceptronSettings):
     )
 
 
+class LrrSettings(PerceptronSettings):
+    """Likelihood reward redistribution (Xiao and Yu, arXiv 2503.17409)."""
+
+    correlation: Literal['kernel', 'none'] = Field(
+        'kernel',
+        description="how the rewards of a segment's steps are related: by a kernel, as in the "
+        'published version (GP-LRR), or not at all, each with a deviation of its own, as in the '
+        'first',
+    )
+    kernel: Literal['rbf', 'matern', 'rational_quadratic'] = Field(
+        'rbf', description='kernel of the Gaussian process; matern is the one of smoothness 3/2'
+    )
+    length_scale: float = Field(
+        1.0, gt=0, le=1e6, description='length scale of the kernel at the start'
+    )
+    signal: float = Field(
+        1.0, gt=0, le=1e6, description='deviation of step rewards from their mean at the start'
+    )
+    noise: float = Field(0.1, gt=0, le=1e6, description='deviation of the noise at the start')
+    batch: int = Field(64, ge=1, le=65536, description='segments in a gradient step')
+    learning_rate: float = Field(1e-3, gt=0, le=1, description='AdamW learning rate')
+    gradient_norm: float = Field(
+        1.0, gt=0, le=1e6, description='largest norm of a gradient; longer ones are shortened'
+    )
+
+
 class EvidenceSettings(Group):
     """Step rewards by Bayesian regression on scores."""
 

@@ -19,6 +19,7 @@ from codetr_ros.config.methods import (
     EvidenceSettings,
     HcSettings,
     LirpgSettings,
+    LrrSettings,
     MlpSettings,
     RbtSettings,
     RrdSettings,
@@ -46,6 +47,7 @@ Method = Literal[
     'rbt',
     'rrd',
     'ircr',
+    'lrr',
     'hc',
     'lirpg',
     'mlp',
@@ -176,6 +178,9 @@ class Settings(Schedule, Group):
     )
     rrd: RrdSettings = Field(
         default_factory=RrdSettings, description='randomized return decomposition'
+    )
+    lrr: LrrSettings = Field(
+        default_factory=LrrSettings, description='likelihood reward redistribution'
     )
     mlp: MlpSettings = Field(
         default_factory=MlpSettings, description='the reward model of single steps'

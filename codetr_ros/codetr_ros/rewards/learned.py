@@ -60,6 +60,8 @@ class Learned(Predictor):
     def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
         super().__init__(settings, observation_size, action_size)
         self._own: CodetrSettings | PerceptronSettings = getattr(settings, self.group)
+        self.gradient_norm = math.inf
+        """The longest gradient; longer ones are shortened to it."""
         self.device = usable(settings.reward_device, 'reward_device')
         self._mean = torch.zeros(observation_size, device=self.device)
         self._std = torch.ones(observation_size, device=self.device)
@@ -143,6 +145,8 @@ class Learned(Predictor):
                     f'diverged. Lower {self.group}.learning_rate = {self._own.learning_rate} '
                     'or set target_scale = rms'
                 )
+        if math.isfinite(self.gradient_norm):
+            nn.utils.clip_grad_norm_(self.network.parameters(), self.gradient_norm)
         rate = self._learning_rate()
         for group in self._optimiser.param_groups:
             group['lr'] = rate

@@ -48,10 +48,10 @@ class Mlp(Learned):
         return rewards
 
 
-def perceptron(inputs: int, hidden: Sequence[int]) -> nn.Sequential:
-    """Linear layers with ReLU between them and one output; Xavier weights, zero biases."""
+def perceptron(inputs: int, hidden: Sequence[int], outputs: int = 1) -> nn.Sequential:
+    """Linear layers with ReLU between them; Xavier weights, zero biases."""
     layers: list[nn.Module] = []
-    for before, after in itertools.pairwise((inputs, *hidden, 1)):
+    for before, after in itertools.pairwise((inputs, *hidden, outputs)):
         layer = nn.Linear(before, after)
         nn.init.xavier_uniform_(layer.weight)
         nn.init.zeros_(layer.bias)

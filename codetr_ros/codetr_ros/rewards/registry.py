@@ -5,6 +5,7 @@ from codetr_ros.rewards.base import RewardMethod, RewardModelError
 from codetr_ros.rewards.codetr import Codetr
 from codetr_ros.rewards.evidence.method import Evidence
 from codetr_ros.rewards.ircr import Ircr
+from codetr_ros.rewards.lrr import Lrr
 from codetr_ros.rewards.mlp import Mlp
 from codetr_ros.rewards.rbt import Rbt
 from codetr_ros.rewards.redistribution import LastStep, Ones, Random, TrueReward, Uniform
@@ -18,6 +19,7 @@ METHODS: dict[str, type[RewardMethod]] = {
         Rbt,
         Rrd,
         Ircr,
+        Lrr,
         Mlp,
         Evidence,
         Uniform,

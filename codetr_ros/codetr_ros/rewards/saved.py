@@ -28,7 +28,8 @@ _OF_TRAINING = frozenset(
         *('batch', 'learning_rate', 'weight_decay', 'dropout', 'warmup_gradient_steps'),
         *('schedule', 'total_gradient_steps', 'first_gradient_steps', 'gradient_steps'),
         *('initialisation', 'label_batch', 'state_loss_weight', 'loss', 'subsequences'),
-        *('subsequence_steps', 'scores', 'steps', 'scale_scores'),
+        *('subsequence_steps', 'scores', 'steps', 'scale_scores', 'gradient_norm'),
+        *('kernel', 'signal', 'length_scale', 'noise'),
     ]
 )
 """Settings of a reward model on which neither its weights' shapes nor its labels depend."""
