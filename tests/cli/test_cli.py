@@ -1,11 +1,14 @@
 import json
 import os
+import platform
+import shlex
 import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from datetime import datetime
 from pathlib import Path
 
 import pytest
@@ -16,6 +19,7 @@ from codetr_ros.config import Settings, SettingsError
 from codetr_ros.processes import launcher
 from codetr_ros.records import ROLES
 from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs import run_summary, segments
 from helpers.executables import prefix
 
 SMALL = {
@@ -235,6 +239,26 @@ def test_a_run_in_process_leaves_summary_metrics_report_and_picture(run_dir: Pat
     for name in (run_folder.REPORT, run_folder.PICTURE, run_folder.CONFIG):
         assert (run_dir / name).stat().st_size > 0
     assert run_folder.read_settings(run_dir).hash() == said['settings_hash']
+
+
+def test_the_true_step_rewards_of_a_shown_segment_add_up_to_its_score(run_dir: Path) -> None:
+    shown = segments.read_csv(run_dir / run_folder.STEP_REWARDS)
+
+    assert len(shown) == 6
+    for one in shown:
+        assert one.value == pytest.approx(float(one.true.sum()), rel=1e-5)
+        assert len(one.labels) == len(one.true)
+    assert [one.value for one in shown] == sorted(one.value for one in shown)
+
+
+def test_a_run_names_date_host_and_the_command_that_repeats_it(run_dir: Path) -> None:
+    made = run_summary.read(run_dir / run_folder.SUMMARY)
+
+    assert made.command == shlex.join(
+        ['codetr', 'train', '--in-process', '--out', str(run_dir), *TINY]
+    )
+    assert datetime.fromisoformat(made.began).timestamp() == pytest.approx(time.time(), abs=3600)
+    assert made.host == platform.node()
 
 
 def test_evaluate_gives_what_the_runs_last_evaluation_gave(

@@ -262,3 +262,20 @@ def test_a_gpu_is_refused_where_the_policy_learner_has_no_use_for_it(method: str
     with pytest.raises(SettingsError, match=f'device=cuda with method={method}: .*device=cpu'):
         settings(method=method, device='cuda')
     assert settings(method='uniform', device='cuda:1').device == 'cuda:1'
+
+
+@pytest.mark.parametrize('preset', config.PRESETS)
+def test_the_nearest_preset_is_that_from_which_fewest_settings_differ(preset: str) -> None:
+    changes = {'task': 'Hopper-v5', 'seed': 3, 'sac.hidden': (7, 7)}
+    mine = config.load(preset).changed(changes).model_dump(mode='json')
+
+    assert config.nearest(mine) == preset
+    there = config.load(preset).flat()
+    assert config.differences(mine, preset) == [
+        (name, list(there[name]) if name == 'sac.hidden' else there[name], value)
+        for name, value in (('task', 'Hopper-v5'), ('seed', 3), ('sac.hidden', [7, 7]))
+    ]
+
+
+def test_a_setting_that_a_preset_does_not_know_differs_from_it() -> None:
+    assert config.differences({'sac': {'of_old': None}}, 'cpu') == [('sac.of_old', None, None)]

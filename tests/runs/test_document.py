@@ -10,8 +10,11 @@ from codetr_ros.runs import document
 from codetr_ros.runs.document import (
     Bold,
     Facts,
+    Folded,
+    Gallery,
     Heading,
     Items,
+    Links,
     Paragraph,
     Picture,
     Table,
@@ -29,6 +32,9 @@ BLOCKS = [
     Facts([(HOSTILE, HOSTILE)]),
     Picture('curve.png', HOSTILE),
     Verbatim(HOSTILE),
+    Gallery([Picture(b'PNG', HOSTILE)]),
+    Links([('bag/', HOSTILE)]),
+    Folded(HOSTILE, [Paragraph(HOSTILE)]),
 ]
 
 
@@ -49,7 +55,7 @@ def test_a_browser_drops_no_declaration_of_the_style_sheet():
     assert not broken, [error.message for error in broken]
     values = {d.name: tinycss2.serialize(d.value).strip() for d in declarations()}
     assert values['border-collapse'] == 'collapse'
-    assert values['max-width'] in ('72rem', '46rem', '100%')
+    assert values['max-width'] in ('72rem', '46rem', 'min(100%, 46rem)')
 
 
 def test_the_style_sheet_has_a_rule_for_every_class_that_a_page_uses():
@@ -81,7 +87,9 @@ def test_what_a_run_names_is_escaped_and_every_tag_is_closed():
     tags.feed(document.page(BLOCKS))
     assert not tags.open
     assert 'script' not in tags.seen
-    assert {'h1', 'p', 'ul', 'table', 'img', 'pre', 'b'} <= set(tags.seen)
+    assert {'h1', 'p', 'ul', 'table', 'img', 'pre', 'b', 'a', 'details', 'summary'} <= set(
+        tags.seen
+    )
 
 
 def test_a_picture_given_as_bytes_lies_in_the_page_itself():
@@ -94,18 +102,30 @@ def test_markdown_holds_no_bytes_and_says_so():
         document.markdown([Picture(b'\x89PNG', 'curve')])
 
 
+def test_what_is_folded_and_what_is_linked_is_in_markdown_too():
+    text = document.markdown(
+        [Folded('More', [Paragraph('inside')]), Links([('bag/', 'the recording')])]
+    )
+    assert text == '### More\n\ninside\n\n- [bag/](bag/): the recording\n'
+
+
 def test_markdown_keeps_a_table_whole_whatever_its_cells_hold():
     text = document.markdown([Table(['a', 'b'], [['1|2', Bold('3\n4')]])])
     assert text.splitlines() == ['| a | b |', '| --- | ---: |', '| 1\\|2 | **3 4** |']
 
 
 def test_values_for_people_are_short_numbers_lists_with_commas_and_nothing_for_none():
-    shown = facts({'rate': 0.1 + 0.2, 'hidden': (256, 256), 'seed': 7, 'failure': None})
+    shown = facts(
+        {'rate': 0.1 + 0.2, 'hidden': (256, 256), 'seed': 7, 'failure': None, 'tiny': 6.5e-06}
+        | {'overlap': True}
+    )
     assert list(shown.rows) == [
         ('rate', '0.3'),
         ('hidden', '256, 256'),
         ('seed', '7'),
         ('failure', ''),
+        ('tiny', '0.0000065'),
+        ('overlap', 'yes'),
     ]
 
 

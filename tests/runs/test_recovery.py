@@ -5,9 +5,9 @@ import pytest
 from scipy import stats
 
 from codetr_ros.cores import in_process
-from codetr_ros.records import Record, StepRewards, TrueRewards
+from codetr_ros.records import CompositeReward, Record, StepRewards, TrueRewards
 from codetr_ros.runs.recovery import Recovery, RecoveryError
-from helpers.builders import step_rewards, tiny
+from helpers.builders import score, step_rewards, tiny
 
 SETTINGS = tiny(delay=2, steps=600, phase_steps=100, warmup_steps=100, evaluate_every=100)
 
@@ -67,6 +67,55 @@ def test_the_newest_labels_are_compared_with_the_true_rewards_of_their_steps():
     ]
     within = [np.append(np.ravel(centred[i : i + 3]), 0.0) for i in (0, 3)]
     assert row['within'] == pytest.approx(stats.pearsonr(*within).statistic)
+
+
+def score_of(episode: int, first_step: int, value: float, **changes) -> CompositeReward:
+    return score(episode=episode, first_step=first_step, length=2, value=value, **changes)
+
+
+def test_segments_shown_range_from_the_lowest_to_the_highest_score_of_the_last_comparison():
+    recovery = Recovery(SETTINGS.changed({'memory_steps': 16}))
+    steps = np.arange(20.0)
+    scores = [3.0, 9.0, 1.0, 8.0, 2.0, 7.0, 5.0, 6.0, 4.0, 0.0]
+    given = [(0, 2 * i, [10.0 + 2 * i, 11.0 + 2 * i]) for i in range(10)]
+    # a score may come before its steps, and after them
+    for i in (4, 5, 6):
+        recovery.receive(score_of(0, 2 * i, scores[i]))
+    recovery.receive(true_rewards(0, 0, *steps))
+    for i in (0, 1, 2, 3, 7, 8, 9):
+        recovery.receive(score_of(0, 2 * i, scores[i]))
+    recovery.receive(labels(0, *given))
+
+    shown = recovery.segments
+
+    assert [one.value for one in shown] == [0.0, 1.0, 4.0, 5.0, 7.0, 8.0], (
+        'the first two have left'
+    )
+    for one in shown:
+        i = scores.index(one.value)
+        assert (one.source, one.episode, one.first) == ('sim', 0, 2 * i)
+        assert one.true.tolist() == steps[2 * i : 2 * i + 2].tolist()
+        assert one.labels.tolist() == given[i][2]
+
+
+def test_a_segment_whose_first_steps_have_left_the_memory_is_not_shown():
+    recovery = Recovery(SETTINGS.changed({'memory_steps': 3}))
+    recovery.receive(true_rewards(0, 0, 1.0, 2.0, 3.0, 4.0, 5.0))
+    recovery.receive(labels(0, (0, 0, [1.0, 2.0]), (0, 2, [3.0, 4.0])))
+    assert [(one.first, one.value) for one in recovery.segments] == [(2, None)]
+
+    recovery.receive(true_rewards(1, 0, 9.0, 8.0))
+    recovery.receive(labels(1, (0, 2, [3.0, 4.0]), (1, 0, [9.0, 8.0])))
+    (one,) = recovery.segments
+    assert (one.episode, one.labels.tolist()) == (1, [9.0, 8.0])
+
+
+def test_mean_and_deviation_of_both_sides_stand_beside_their_correlation():
+    true, given = [1.0, 2.0, 4.0, 3.0], [0.0, 2.0, 1.0, -1.0]
+    (row,) = observe(true_rewards(0, 0, *true), labels(0, (0, 0, given[:2]), (0, 2, given[2:])))
+
+    assert (row['true_mean'], row['inferred_mean']) == (2.5, 0.5)
+    assert (row['true_std'], row['inferred_std']) == pytest.approx((np.std(true), np.std(given)))
 
 
 def test_labels_given_again_to_some_steps_of_a_segment_leave_it_one_segment():

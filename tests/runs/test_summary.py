@@ -1,7 +1,6 @@
 import csv
 import io
 import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ from codetr_ros.records import metrics
 from codetr_ros.runs import facts, report, summary
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.progress import Progress
-from codetr_ros.runs.run_summary import RewardRecovery
 from codetr_ros.runs.summary import Summary
 from helpers.bags import ours
 from helpers.builders import step_rewards
@@ -154,49 +152,6 @@ def test_several_nodes_of_a_role_get_columns_of_their_own() -> None:
     (row,) = table(made.metrics_csv())
 
     assert (row['sim.simulate_seconds'], row['sim_2.simulate_seconds']) == ('1.0', '2.0')
-
-
-def test_the_report_is_one_file_that_holds_picture_tables_and_settings(tmp_path: Path) -> None:
-    report.write(tmp_path, run_summary(failure='learner <died>'))
-
-    page = (tmp_path / run_folder.REPORT).read_text()
-    assert (tmp_path / run_folder.PICTURE).read_bytes().startswith(b'\x89PNG')
-    assert 'src="data:image/png;base64,iVBOR' in page
-    assert not re.search(r'(src|href)="(?!data:)', page), 'nothing is fetched from elsewhere'
-    assert 'learner &lt;died&gt;' in page
-    assert '<td>composite_rewards</td>' in page
-    assert '<tr><td>codetr.learning_rate</td><td>0.001</td></tr>' in page
-    assert '<td>225</td>' in page
-
-
-@pytest.mark.parametrize(
-    ('rows', 'shown'),
-    [
-        ([], 'no labels were compared'),
-        ([(4000, 0.125, 0.5)], 'correlation 0.12, within segments 0.50'),
-        ([(4000, 0.125, None)], 'correlation 0.12'),
-        ([(2000, 0.125, None)], 'correlation 0.12, after 2000 steps'),
-        ([(2000, 0.9, 0.9), (4000, None, None)], 'not defined where one side does not vary'),
-    ],
-)
-def test_the_report_tells_the_last_reward_recovery(rows, shown):
-    names = 'step', 'pearson', 'within'
-    made = run_summary()
-    recovery = [
-        RewardRecovery(spearman=None, steps=100, **dict(zip(names, row, strict=True)))
-        for row in rows
-    ]
-    last = made.evaluations[-1].model_copy(update={'step': 4000})
-    said = made.model_copy(update={'evaluations': [last], 'reward_recovery': recovery})
-    assert dict(report.result_rows(said))['reward recovery'] == shown
-
-
-@pytest.mark.parametrize(
-    ('encoding', 'shown'), [('utf-8', '▁▄█▁'), ('ascii', '.=@.'), (None, '.=@.')]
-)
-def test_the_sketch_of_a_curve_fits_the_terminal(encoding: str | None, shown: str) -> None:
-    assert report.sketch([0, 50, 110, 0], encoding) == shown
-    assert report.sketch([3.0, 3.0], 'utf-8') == '▁▁'
 
 
 def test_what_is_learnt_about_a_run_that_has_ended_takes_none_of_its_time():

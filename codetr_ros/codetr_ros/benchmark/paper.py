@@ -94,10 +94,5 @@ def settings_differences(settings: Mapping[str, Any]) -> list[tuple[str, Any, An
 
     The axes of a benchmark (task, composite, delay, method, seed) are left out.
     """
-    there = dict(config.flatten(config.load('paper').model_dump(mode='json')))
     varied = ('task', 'composite', 'delay', 'method', 'seed')
-    return [
-        (name, there.get(name), value)
-        for name, value in config.flatten(settings)
-        if name not in varied and value != there.get(name)
-    ]
+    return [row for row in config.differences(settings, 'paper') if row[0] not in varied]

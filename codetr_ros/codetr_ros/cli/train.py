@@ -4,6 +4,7 @@ import dataclasses
 import os
 import re
 import secrets
+import shlex
 import time
 import traceback
 from collections.abc import Mapping, Sequence
@@ -22,7 +23,15 @@ from codetr_ros.config import Settings, SettingsError
 from codetr_ros.processes import launcher
 from codetr_ros.processes.launcher import LaunchError
 from codetr_ros.processes.supervise import Interrupts, Silence, supervise, why_it_gave_up
-from codetr_ros.records import Commit, EpisodeResult, Metrics, Record, StepRewards, TrueRewards
+from codetr_ros.records import (
+    Commit,
+    CompositeReward,
+    EpisodeResult,
+    Metrics,
+    Record,
+    StepRewards,
+    TrueRewards,
+)
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import report
 from codetr_ros.runs import reports as node_reports
@@ -101,7 +110,8 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
         return refuse(str(error))
     # A letter first: as a ROS parameter and in a namespace it must not read as a number.
     run_id = f'r{stamp.replace("-", "_")}_{secrets.token_hex(2)}'
-    return train(settings, run_id, folder, in_process, start)
+    command = shlex.join(['codetr', 'train', *arguments])
+    return train(settings, run_id, folder, in_process, start, command)
 
 
 def default_out(settings: Settings, stamp: str) -> str:
@@ -116,6 +126,7 @@ def train(
     folder: Path,
     in_process: bool,
     start: launcher.Start = launcher.start_program,
+    command: str | None = None,
 ) -> int:
     """Do a run and write everything about it into its folder.
 
@@ -125,6 +136,7 @@ def train(
         folder: its folder, which exists.
         in_process: run without nodes.
         start: starts the nodes.
+        command: the command line, for the summary.
 
     Returns:
         The exit code: 0 finished, 1 failed, 2 refused, 130 interrupted.
@@ -133,7 +145,7 @@ def train(
         run_folder.write_settings(folder, settings)
     except OSError as error:
         return refuse(str(error))
-    summary = Summary(settings, run_id, in_process)
+    summary = Summary(settings, run_id, in_process, command=command)
     progress = Progress(settings)
     progress.log(
         f'{settings.task}: {settings.composite} of {settings.delay} steps, method '
@@ -150,7 +162,7 @@ def train(
             outcome.reports, bag if bag.is_dir() else None, outcome.interrupted, outcome.failure
         )
         try:
-            write_summary(folder, built, summary.metrics_csv())
+            write_summary(folder, built, summary.metrics_csv(), summary.segments())
             report.write(folder, built)
         except OSError as error:
             outcome.failure = '; '.join(filter(None, (outcome.failure, str(error))))
@@ -280,7 +292,8 @@ def _complete(summary: Summary, folder: Path, progress: Progress, interrupts: In
     try:
         bag = Bag(folder / run_folder.BAG)
         # labels last: they may have been recorded before the true rewards of their phase
-        for kinds in (EpisodeResult, Metrics, Commit, TrueRewards), (StepRewards,):
+        unlabelled = (EpisodeResult, Metrics, Commit, TrueRewards, CompositeReward)
+        for kinds in unlabelled, (StepRewards,):
             for entry in bag.entries(kinds):
                 if interrupts.count > asked:
                     progress.log('stopped: the summary holds what was read until now')

@@ -3,7 +3,14 @@ parameters.
 """
 
 from codetr_ros.config.base import Group, SettingsError, explain, flatten, validate
-from codetr_ros.config.loading import PRESETS, from_canonical, load, parse
+from codetr_ros.config.loading import (
+    PRESETS,
+    differences,
+    from_canonical,
+    load,
+    nearest,
+    parse,
+)
 from codetr_ros.config.methods import (
     CodetrSettings,
     HcSettings,
@@ -35,10 +42,12 @@ __all__ = [
     'SacSettings',
     'Settings',
     'SettingsError',
+    'differences',
     'explain',
     'flatten',
     'from_canonical',
     'load',
+    'nearest',
     'parse',
     'validate',
 ]

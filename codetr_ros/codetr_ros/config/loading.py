@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from codetr_ros.config.base import SettingsError, validate
+from codetr_ros.config.base import SettingsError, flatten, validate
 from codetr_ros.config.run import Settings
 
 PRESETS = ('quick', 'cpu', 'paper')
@@ -50,6 +50,26 @@ def load(name: str) -> Settings:
     if not isinstance(data, Mapping):
         raise SettingsError(f'{source} must hold a mapping of settings, not {type(data).__name__}')
     return parse(data, source)
+
+
+def differences(settings: Mapping[str, Any], preset: str) -> list[tuple[str, Any, Any]]:
+    """Settings that differ from those of a preset: dotted name, value there, value here.
+
+    Args:
+        settings: nested mapping, as JSON has it; it may be of an earlier version of the program.
+        preset: name of the preset. A setting that it does not know is None there.
+    """
+    there = dict(flatten(load(preset).model_dump(mode='json')))
+    return [
+        (name, there.get(name), value)
+        for name, value in flatten(settings)
+        if name not in there or value != there[name]
+    ]
+
+
+def nearest(settings: Mapping[str, Any]) -> str:
+    """The preset from which fewest settings differ."""
+    return min(PRESETS, key=lambda preset: len(differences(settings, preset)))
 
 
 def from_canonical(text: str, source: str) -> Settings:

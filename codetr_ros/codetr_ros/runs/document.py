@@ -10,6 +10,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from codetr_ros.runs.numbers import exact
+
 STYLE = """
 :root { color-scheme: light dark }
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto;
@@ -18,7 +20,7 @@ h1 { font-size: 1.4rem; line-height: 1.3; overflow-wrap: anywhere }
 h2 { font-size: 1.15rem; margin-top: 2.2rem }
 h3 { font-size: 1rem }
 p, li { max-width: 46rem }
-img { max-width: 100%; height: auto; background: #fff }
+img { max-width: min(100%, 46rem); height: auto; background: #fff }
 pre { background: #8882; padding: .6rem; overflow-x: auto; font-size: .85em }
 .wide { overflow-x: auto }
 table { border-collapse: collapse }
@@ -30,6 +32,11 @@ th:first-child, td:first-child { padding-left: 0; text-align: left }
   vertical-align: top }
 .facts td:first-child { min-width: 9rem }
 .bad { color: #d22d3a; font-weight: 600 }
+.gallery { display: grid; gap: .8rem;
+  grid-template-columns: repeat(auto-fill, minmax(min(22rem, 100%), 1fr)) }
+.gallery img { width: 100% }
+details { margin-top: 1.2rem }
+summary { cursor: pointer; font-weight: 600 }
 """
 
 
@@ -90,21 +97,47 @@ class Picture:
 
 
 @dataclass(frozen=True)
+class Gallery:
+    """Small pictures, beside each other where there is room."""
+
+    pictures: Sequence[Picture]
+
+
+@dataclass(frozen=True)
+class Links:
+    """Files beside the document, each with what it is."""
+
+    rows: Sequence[tuple[str, str]]
+
+
+@dataclass(frozen=True)
 class Verbatim:
     """The output of a program."""
 
     text: str
 
 
-Block = Heading | Paragraph | Items | Table | Facts | Picture | Verbatim
+@dataclass(frozen=True)
+class Folded:
+    """Blocks that a page shows on request only."""
+
+    title: str
+    blocks: 'Sequence[Block]'
+
+
+Block = Heading | Paragraph | Items | Table | Facts | Picture | Gallery | Links | Verbatim | Folded
 
 
 def cell(value: Any) -> str:
-    """A value for people: numbers with six digits, sequences with commas, None as empty text."""
+    """A value for people: numbers with six digits and no exponent, sequences with commas, truth as
+    `yes` and `no`, None as empty text.
+    """
     if value is None:
         return ''
+    if isinstance(value, bool):
+        return 'yes' if value else 'no'
     if isinstance(value, float):
-        return f'{value:.6g}'
+        return exact(value)
     if isinstance(value, (list, tuple)):
         return ', '.join(map(str, value))
     return str(value)
@@ -142,6 +175,12 @@ def _markdown(block: Block) -> str:
             if isinstance(source, bytes):
                 raise ValueError(f'picture {alt!r}: Markdown holds no bytes; give it a file name')
             return f'![{alt}]({source})'
+        case Gallery(pictures):
+            return '\n'.join(_markdown(picture) for picture in pictures)
+        case Links(rows):
+            return '\n'.join(f'- [{target}]({target}): {text}' for target, text in rows)
+        case Folded(title, blocks):
+            return '\n\n'.join([f'### {title}', *(_markdown(each) for each in blocks)])
         case Verbatim(text):
             return '\n'.join(f'    {line}' for line in text.splitlines())
         case Table(head, rows):
@@ -187,6 +226,18 @@ def _html(block: Block) -> str:
             if isinstance(source, bytes):
                 source = f'data:image/png;base64,{base64.b64encode(source).decode()}'
             return f'<img alt="{html.escape(alt)}" src="{html.escape(source)}">'
+        case Gallery(pictures):
+            return f'<div class="gallery">{"".join(_html(each) for each in pictures)}</div>'
+        case Links(rows):
+            lines = ''.join(
+                f'<li><a href="{html.escape(target)}">{html.escape(target)}</a>: '
+                f'{html.escape(text)}</li>'
+                for target, text in rows
+            )
+            return f'<ul>{lines}</ul>'
+        case Folded(title, blocks):
+            inner = '\n'.join(_html(each) for each in blocks)
+            return f'<details><summary>{html.escape(title)}</summary>\n{inner}</details>'
         case Verbatim(text):
             return f'<pre>{html.escape(text)}</pre>'
         case Table(head, rows):

@@ -16,8 +16,10 @@ NODES = 'nodes'
 LOGS = 'logs'
 SUMMARY = 'summary.json'
 METRICS = 'metrics.csv'
+STEP_REWARDS = 'step_rewards.csv'
 REPORT = 'report.html'
 PICTURE = 'learning_curve.png'
+FILM = 'film.png'
 
 
 class RunFolderError(ValueError):

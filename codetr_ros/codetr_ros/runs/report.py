@@ -1,99 +1,127 @@
-"""The report of a run for people: a picture of the learning curve and one HTML page."""
+"""The report of a run for people: a picture of the learning curve and one HTML page.
 
-import io
+Everything comes from the run's folder: `summary.json`, and `metrics.csv`, `step_rewards.csv` and
+`film.png` where they are.
+"""
+
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from codetr_ros.config import flatten
-from codetr_ros.runs import document
+from codetr_ros.runs import course, document, pictures, segments
 from codetr_ros.runs import folder as run_folder
-from codetr_ros.runs.document import Block, Heading, Paragraph, Picture, facts, records
+from codetr_ros.runs.document import (
+    Block,
+    Gallery,
+    Heading,
+    Paragraph,
+    Picture,
+    Table,
+    facts,
+)
+from codetr_ros.runs.numbers import column
+from codetr_ros.runs.report_origin import FILES, details, origin
+from codetr_ros.runs.report_text import (
+    learnt,
+    recovery_text,
+    result_rows,
+    scale_text,
+    sketch,
+    title,
+)
 from codetr_ros.runs.run_summary import RunSummary
+from codetr_ros.runs.segments import Segment
 from codetr_ros.system.files import atomic_write
 
-_TRUE, _SCORE = '#1f5fa8', '#b8561c'
+__all__ = ['Material', 'draw', 'page', 'result_rows', 'sketch', 'title', 'write']
+
+_SCORE = '#b8561c'
 
 
-def title(summary: RunSummary) -> str:
-    """Names the run in a line."""
-    s = summary
-    what = f'{s.task}, {s.composite} of {s.delay} steps, {s.method}, seed {s.seed}'
-    return what + (' (interrupted)' if s.interrupted else '')
+@dataclass(frozen=True, kw_only=True)
+class Material:
+    """What a page shows beside the summary.
+
+    Attributes:
+        columns: of `metrics.csv`.
+        segments: some, step by step.
+        film: a picture of the robot under the first and the last policy; None if there is none.
+        film_note: what to know about it, or why there is none.
+        files: those of the run's folder, each with what it is.
+        notes: what could not be read.
+    """
+
+    columns: dict[str, course.Points] = field(default_factory=dict)
+    segments: Sequence[Segment] = ()
+    film: bytes | None = None
+    film_note: str = ''
+    files: Sequence[tuple[str, str]] = ()
+    notes: Sequence[str] = ()
 
 
 def draw(summary: RunSummary) -> bytes:
     """The learning curve as a PNG: true return and score of each evaluation against steps.
 
-    The bands show the spread over an evaluation's episodes: worst to best for the true return, one
-    standard deviation for the score. The dashed lines are the random policy.
+    It begins at step 0 with the random policy, which the dashed lines repeat. The bands show the
+    spread over an evaluation's episodes: worst to best for the true return, one standard deviation
+    for the score.
     """
-    # Without pyplot: no display, no state that outlives the picture, half the import time.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    rows = summary.evaluated()
+    steps = [row.step for row in rows]
 
-    rows, random = summary.evaluations, summary.random
-    figure = Figure(figsize=(8, 6), dpi=120, layout='constrained')
-    FigureCanvasAgg(figure)
-    figure.suptitle(title(summary), fontsize=11)
-    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
-    upper.set_ylabel('true return of an episode')
-    lower.set_ylabel('score\n(composite return / perfect)')
-    lower.set_xlabel('environment steps')
-    lower.set_xlim(0, summary.steps_planned)
-
-    def column(name: str) -> list[float]:
+    def numbers(name: str) -> list[float]:
         values = [getattr(row, name) for row in rows]
         return [math.nan if value is None else value for value in values]
 
-    score, std = column('score_mean'), column('score_std')
-    for axes, colour, mean, low, high, name in (
-        (
-            upper,
-            _TRUE,
-            column('true_return_mean'),
-            column('true_return_min'),
-            column('true_return_max'),
-            'true_return_mean',
-        ),
-        (
-            lower,
-            _SCORE,
-            score,
-            [m - s for m, s in zip(score, std, strict=True)],
-            [m + s for m, s in zip(score, std, strict=True)],
-            'score_mean',
-        ),
-    ):
-        axes.grid(alpha=0.3)
+    score, std = numbers('score_mean'), numbers('score_std')
+    low = [m - s for m, s in zip(score, std, strict=True)]
+    high = [m + s for m, s in zip(score, std, strict=True)]
+    worst, best = numbers('true_return_min'), numbers('true_return_max')
+
+    def curve(
+        axes: Any, name: str, colour: str, lower: list[float], upper: list[float], spread: str
+    ) -> None:
         if rows:
-            steps = column('step')
-            spread = 'worst to best' if axes is upper else 'standard deviation'
-            axes.fill_between(steps, low, high, color=colour, alpha=0.15, lw=0, label=spread)
-            axes.plot(steps, mean, 'o-', color=colour, markersize=4, label='mean')
+            axes.fill_between(steps, lower, upper, color=colour, alpha=0.15, lw=0, label=spread)
+            points = list(zip(steps, numbers(name), strict=True))
+            pictures.line(axes, points, 'mean', colour)
         else:
             axes.text(0.5, 0.5, 'no evaluation', transform=axes.transAxes, ha='center')
-        if random:
-            axes.axhline(getattr(random, name), color='#555', ls='--', lw=1, label='random policy')
-        if rows or random:
+        if summary.random:
+            value = getattr(summary.random, name)
+            axes.axhline(value, color=pictures.GREY, ls='--', lw=1, label='random policy')
+        if rows:
             axes.legend(loc='best', fontsize=8, framealpha=0.8)
-    picture = io.BytesIO()
-    figure.savefig(picture, format='png')
-    return picture.getvalue()
+        pictures.plain(axes)
+
+    def both(figure: Any) -> None:
+        figure.suptitle(title(summary), fontsize=10)
+        above, below = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
+        above.set_ylabel('true return of an episode')
+        below.set_ylabel('score\n(1: perfect)')
+        below.set_xlabel('environment steps')
+        below.set_xlim(0, summary.steps_planned)
+        curve(above, 'true_return_mean', pictures.TRUE, worst, best, 'worst to best')
+        curve(below, 'score_mean', _SCORE, low, high, 'standard deviation')
+
+    return pictures.png((pictures.WIDE, 4.8), both)
 
 
-def page(summary: RunSummary, picture: bytes) -> str:
-    """The HTML page, with everything in it."""
-    identity = {
-        name: getattr(summary, name)
-        for name in ('run_id', 'policy_sha256', 'reward_model_sha256', 'settings_hash')
-    }
-    versions = {f'version of {name}': value for name, value in summary.versions.items()}
-    processes = [{'process': n, **row.model_dump()} for n, row in summary.processes.items()]
-    messages = [{'topic': topic, **row.model_dump()} for topic, row in summary.messages.items()]
+def page(summary: RunSummary, picture: bytes, material: Material | None = None) -> str:
+    """The HTML page, with everything in it.
+
+    Args:
+        summary: of the run.
+        picture: the learning curve.
+        material: what else to show; None: nothing.
+    """
+    given = material or Material()
     blocks: list[Block] = [
         Heading(title(summary), 1),
         *([Paragraph(summary.failure, bad=True)] if summary.failure else []),
+        *([Paragraph(text)] if (text := learnt(summary)) else []),
         Picture(picture, 'learning curve'),
         Heading('Result'),
         facts(result_rows(summary)),
@@ -101,78 +129,131 @@ def page(summary: RunSummary, picture: bytes) -> str:
             'The score is the composite return of an episode over that of an agent that earns the '
             "task's largest reward at every step."
         ),
+        *_film(given),
         Heading('Evaluations'),
-        records([row.model_dump() for row in summary.evaluated()]),
-        Heading('Messages'),
-        records(messages),
-        Heading('Processes'),
-        records(processes),
-        Heading('Settings'),
-        facts(list(flatten(summary.settings))),
-        Heading('Identity'),
-        facts(identity | versions),
+        _evaluations(summary),
+        *_recovery(summary, given.segments),
+        *_training(summary, given.columns),
+        *origin(summary, given.files),
+        *(Paragraph(note, bad=True) for note in given.notes),
+        *details(summary),
     ]
     return document.page(blocks)
 
 
-def result_rows(summary: RunSummary) -> list[tuple[str, str]]:
-    """The few numbers that people look for first, for the page and the terminal."""
-
-    def number(value: float | None, form: str) -> str:
-        return 'not evaluated' if value is None else format(value, form)
-
-    last = summary.evaluations[-1] if summary.evaluations else None
-    spread = f' +- {last.true_return_std:.1f}' if last and last.true_return_std is not None else ''
-    after = f' after {last.step} steps' if last else ''
-    return [
-        ('score', f'{number(summary.final_score, ".3f")}{after}'),
-        ('score of the random policy', number(summary.random_score, '.3f')),
-        ('true return', f'{number(summary.final_true_return, ".1f")}{spread}'),
-        ('true return of the random policy', number(summary.random_true_return, '.1f')),
-        ('reward recovery', _recovery(summary)),
-        ('steps', f'{summary.steps} of {summary.steps_planned}'),
-        ('phases', f'{summary.phases} of {summary.phases_planned}'),
-        ('time', f'{summary.wall_s:.1f} s, {summary.steps_per_s or 0:.0f} steps per second'),
-        (
-            'messages',
-            f'{sum(row.published for row in summary.messages.values())} published, '
-            f'{summary.lost} lost, {summary.duplicated} duplicated, {summary.refused} refused',
-        ),
-    ]
+def _film(given: Material) -> Iterator[Block]:
+    if given.film is None and not given.film_note:
+        return
+    yield Heading('The robot under the first and the last policy')
+    if given.film is not None:
+        yield Picture(given.film, 'frames of an episode of each policy')
+    if given.film_note:
+        yield Paragraph(given.film_note)
 
 
-def _recovery(summary: RunSummary) -> str:
-    """The agreement of step rewards with the true ones at the last comparison."""
-    rows, evaluations = summary.reward_recovery, summary.evaluations
+def _evaluations(summary: RunSummary) -> Block:
+    rows = summary.evaluated()
     if not rows:
-        return 'no labels were compared'
-    last = rows[-1]
-    values = {'correlation': last.pearson, 'within segments': last.within}
-    shown = [f'{name} {value:.2f}' for name, value in values.items() if value is not None]
-    late = bool(evaluations) and evaluations[-1].step != last.step
-    after = f', after {last.step} steps' if late else ''
-    return (', '.join(shown) or 'not defined where one side does not vary') + after
+        return Paragraph('None.')
+    returns = [
+        *(row.true_return_mean for row in rows),
+        *(row.true_return_std for row in rows),
+        *(row.true_return_min for row in rows),
+        *(row.true_return_max for row in rows),
+    ]
+    alike = column(returns)
+    columns = [
+        [str(row.step) for row in rows],
+        *(alike[i : i + len(rows)] for i in range(0, len(alike), len(rows))),
+        column([row.score_mean for row in rows]),
+        column([row.score_std for row in rows]),
+        column([row.length_mean for row in rows], most=1),
+        [str(row.episodes) for row in rows],
+    ]
+    if summary.random:
+        columns[0][0] = '0 (random policy)'
+    head = ['after steps', 'true return', 'sd', 'worst', 'best', 'score', 'sd', 'length']
+    return Table([*head, 'episodes'], list(zip(*columns, strict=True)))
 
 
-_BARS = ' ▁▂▃▄▅▆▇█'
+def _recovery(summary: RunSummary, shown: Sequence[Segment]) -> Iterator[Block]:
+    rows = summary.reward_recovery
+    yield Heading('Reward recovery: inferred against true step rewards')
+    if not rows:
+        yield Paragraph('No labels were compared with true rewards in this run.')
+        return
+    yield Paragraph(recovery_text(rows))
+    lines = {
+        'inside segments': [(row.step, row.within) for row in rows if row.within is not None],
+        'all steps': [(row.step, row.pearson) for row in rows if row.pearson is not None],
+    }
+    if any(lines.values()):
+        panel = {'correlation with\ntrue step rewards': lines}
+        yield Picture(
+            pictures.curves(panel, end=summary.steps_planned, correlations=True), 'reward recovery'
+        )
+    if text := scale_text(summary):
+        yield Paragraph(text)
+    if shown:
+        yield Heading('Some segments, step by step', 3)
+        yield Paragraph(
+            'From the lowest to the highest score in memory, evenly chosen, at the last '
+            'evaluation. The policy learns from the orange line; nobody but this report sees the '
+            'blue one.'
+        )
+        yield Gallery([Picture(pictures.segment(one), 'a segment') for one in shown])
 
 
-def sketch(values: Sequence[float], encoding: str | None) -> str:
-    """A learning curve in a line of text: one bar for each value, the highest full."""
-    bars = _BARS
-    try:
-        bars.encode(encoding or 'ascii')
-    except (UnicodeEncodeError, LookupError):
-        bars = ' .:-=+*#@'
-    low, high = min(values), max(values)
-    top = len(bars) - 1
-    if high == low:
-        return bars[1] * len(values)
-    return ''.join(bars[1 + round((v - low) / (high - low) * (top - 1))] for v in values)
+def _training(summary: RunSummary, columns: dict[str, course.Points]) -> Iterator[Block]:
+    returns = columns.get('training.true_return_mean', ())
+    losses = course.losses(columns)
+    if not returns and not losses:
+        return
+    panels = {'true return of\ntraining episodes': {'return': returns}} if returns else {}
+    panels |= {name.replace(' of ', '\nof '): {name: points} for name, points in losses.items()}
+    yield Heading('Training')
+    yield Picture(pictures.curves(panels, end=summary.steps_planned), 'returns and losses')
+    yield Paragraph(
+        'Each point is the mean of a phase. Training episodes are those of the acting policy, '
+        'with its noise; the first phases act at random.'
+    )
 
 
-def write(folder: Path, summary: RunSummary) -> None:
-    """Write the picture and the page into a run's folder."""
+def write(folder: Path, summary: RunSummary, film_note: str = '') -> None:
+    """Write the picture and the page into a run's folder.
+
+    Args:
+        folder: the run's folder.
+        summary: of the run.
+        film_note: what to know about its film, or why it has none.
+    """
     picture = draw(summary)
     atomic_write(folder / run_folder.PICTURE, picture)
-    atomic_write(folder / run_folder.REPORT, page(summary, picture))
+    text = page(summary, picture, _material(folder, film_note))
+    atomic_write(folder / run_folder.REPORT, text)
+
+
+def _material(folder: Path, film_note: str) -> Material:
+    columns: dict[str, course.Points] = {}
+    shown: Sequence[Segment] = ()
+    notes = []
+    try:
+        if (folder / run_folder.METRICS).is_file():
+            columns = course.read(folder / run_folder.METRICS)
+        if (folder / run_folder.STEP_REWARDS).is_file():
+            shown = segments.read_csv(folder / run_folder.STEP_REWARDS)
+    except run_folder.RunFolderError as error:
+        notes.append(str(error))
+    film = folder / run_folder.FILM
+    return Material(
+        columns=columns,
+        segments=shown,
+        film=film.read_bytes() if film.is_file() else None,
+        film_note=film_note,
+        files=[
+            (name + '/' * (folder / name).is_dir(), what)
+            for name, what in FILES
+            if (folder / name).exists()
+        ],
+        notes=notes,
+    )

@@ -49,6 +49,14 @@ class RewardRecovery(Facts):
     )
     spearman: Number = Field(description='rank correlation over all steps')
     steps: int = Field(description='number of labelled steps that were compared')
+    true_mean: Number = Field(None, description="mean of the environment's own rewards")
+    true_std: Number = Field(None, description='their standard deviation')
+    inferred_mean: Number = Field(
+        None,
+        description="mean of the inferred rewards, in the environment's unit; null if the factor "
+        'between the units is not known',
+    )
+    inferred_std: Number = Field(None, description='their standard deviation')
 
 
 class MessageCounts(Facts):
@@ -79,6 +87,13 @@ class RunSummary(Facts):
     """The identity, course and results of a run: the content of `summary.json`."""
 
     run_id: str = Field(description='name of the run')
+    began: str | None = Field(
+        None, description='date and time of its start, ISO 8601 with the offset from UTC'
+    )
+    host: str | None = Field(None, description='name of the machine that started it')
+    command: str | None = Field(
+        None, description='the command that started it; null if nodes were started one by one'
+    )
     task: str = Field(description='task that was simulated')
     composite: str = Field(description="how a segment's rewards made its composite reward")
     delay: int = Field(description='length n of a segment [steps]')
@@ -101,6 +116,11 @@ class RunSummary(Facts):
     reward_recovery: list[RewardRecovery] = Field(
         [],
         description='a row for each evaluation with labels; the first summaries lack it',
+    )
+    label_unit: Number = Field(
+        None,
+        description="unit of the step rewards that the policy learns from, in the environment's; "
+        'null if not known',
     )
     random_score: Number = Field(description='mean score of the random policy')
     final_score: Number = Field(description='mean score of the last evaluation')

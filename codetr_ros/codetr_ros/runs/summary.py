@@ -5,12 +5,12 @@ Both are made from the run's records and from the reports of its nodes.
 
 import csv
 import io
-import resource
+import platform
 import time
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
-from itertools import chain
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import datetime
 from pathlib import Path
 from typing import TypeVar
 
@@ -18,18 +18,14 @@ import numpy as np
 from pydantic import JsonValue
 
 from codetr_ros.config import Settings
-from codetr_ros.records import TOPICS, Commit, EpisodeResult, Metrics, Record
+from codetr_ros.records import Commit, EpisodeResult, Metrics, Record
 from codetr_ros.runs import folder as run_folder
-from codetr_ros.runs import run_summary
+from codetr_ros.runs import run_summary, segments
 from codetr_ros.runs.recovery import Recovery
 from codetr_ros.runs.reports import NodeReport
-from codetr_ros.runs.run_summary import (
-    Evaluation,
-    MessageCounts,
-    ProcessUse,
-    RewardRecovery,
-    RunSummary,
-)
+from codetr_ros.runs.run_summary import Evaluation, RewardRecovery, RunSummary
+from codetr_ros.runs.segments import Segment
+from codetr_ros.runs.tallies import count_messages, processes
 from codetr_ros.system.files import atomic_write
 from codetr_ros.system.versions import versions
 
@@ -86,6 +82,7 @@ class Summary:
         run_id: its name.
         in_process: whether it ran without topics.
         clock: seconds, never going back; the time of the run begins now.
+        command: the command that started it; None if nodes were started one by one.
     """
 
     def __init__(
@@ -94,10 +91,13 @@ class Summary:
         run_id: str,
         in_process: bool,
         clock: Callable[[], float] = time.monotonic,
+        command: str | None = None,
     ) -> None:
         self.settings = settings
         self.run_id = run_id
         self.in_process = in_process
+        self.command = command
+        self.start = datetime.now().astimezone()
         self._clock = clock
         self._began = clock()
         self._evaluations: dict[int, _Results] = {}  # by step
@@ -161,6 +161,41 @@ class Summary:
         """The row of the uniformly random policy; None if it was not evaluated."""
         return self._random.row(0) if self._random else None
 
+    @property
+    def label_unit(self) -> float | None:
+        """The unit of labels in that of the task; None if not known, as before any label."""
+        if self.settings.reward_unit == 'raw':
+            return 1.0
+        scales = [
+            value
+            for _, values in sorted(self._metrics.items())
+            for (role, _, name), value in values.items()
+            if (role, name) == ('reward', 'target_scale')
+        ]
+        return scales[-1] if scales and scales[-1] > 0 else None
+
+    def segments(self) -> list[Segment]:
+        """Some segments with their inferred and true rewards, in the unit of the task; none if the
+        unit of the labels is not known.
+        """
+        unit = self.label_unit
+        if unit is None:
+            return []
+        return [
+            replace(one, labels=one.labels * np.float32(unit)) for one in self._recovery.segments
+        ]
+
+    def _reward_recovery(self) -> list[RewardRecovery]:
+        unit = self.label_unit
+        rows = []
+        for row in self._recovery.rows:
+            inferred = {
+                name: None if unit is None else row[name] * unit
+                for name in ('inferred_mean', 'inferred_std')
+            }
+            rows.append(RewardRecovery.model_validate(row | inferred))
+        return rows
+
     def build(
         self,
         reports: Mapping[str, NodeReport],
@@ -187,6 +222,9 @@ class Summary:
         settings_json: dict[str, JsonValue] = settings.model_dump(mode='json')
         return RunSummary(
             run_id=self.run_id,
+            began=self.start.isoformat(timespec='seconds'),
+            host=platform.node(),
+            command=self.command,
             task=settings.task,
             composite=settings.composite,
             delay=settings.delay,
@@ -204,7 +242,8 @@ class Summary:
             steps_per_s=round(self.steps / wall, 3) if wall > 0 else None,
             evaluations=evaluations,
             random=random,
-            reward_recovery=[RewardRecovery.model_validate(row) for row in self._recovery.rows],
+            reward_recovery=self._reward_recovery(),
+            label_unit=self.label_unit,
             random_score=random.score_mean if random else None,
             final_score=last.score_mean if last else None,
             random_true_return=random.true_return_mean if random else None,
@@ -268,57 +307,15 @@ class Summary:
         return text.getvalue()
 
 
-def count_messages(reports: Mapping[str, NodeReport]) -> dict[str, MessageCounts]:
-    """The numbers of messages of each topic, and what became of them; a topic without messages has
-    a row too.
+def write(
+    folder: Path, summary: RunSummary, metrics_csv: str, shown: Sequence[Segment] = ()
+) -> None:
+    """Write `summary.json`, `metrics.csv` and, if there are segments to show, `step_rewards.csv`
+    into a run's folder.
     """
-    columns: dict[str, Counter[str]] = {name: Counter() for name in MessageCounts.model_fields}
-    for report in reports.values():
-        columns['published'].update(report.published)
-        if report.role in ('learner', 'reward'):
-            columns[f'received_by_{report.role}'].update(report.received)
-        if report.role == 'record':
-            columns['recorded'].update(report.recorded)
-        columns['lost'].update(report.lost)
-        columns['duplicated'].update(report.duplicated)
-        columns['refused'].update(report.refused)
-    topics = dict.fromkeys([*TOPICS.values(), *chain.from_iterable(columns.values())])
-    return {
-        topic: MessageCounts.model_validate({n: column[topic] for n, column in columns.items()})
-        for topic in topics
-    }
-
-
-def processes(reports: Mapping[str, NodeReport]) -> dict[str, ProcessUse]:
-    """The resources that each process used, this one included."""
-    used = {
-        name: ProcessUse(
-            role=report.role,
-            peak_rss_mb=report.peak_rss_mb,
-            cpu_s=report.cpu_s,
-            wall_s=report.wall_s,
-            finished=report.finished,
-            error=report.error,
-            exit_code=report.exit_code,
-        )
-        for name, report in sorted(reports.items())
-    }
-    own = resource.getrusage(resource.RUSAGE_SELF)
-    used['codetr'] = ProcessUse(
-        role='codetr',
-        peak_rss_mb=own.ru_maxrss / 1024,
-        cpu_s=own.ru_utime + own.ru_stime,
-        wall_s=None,
-        finished=None,
-        error=None,
-        exit_code=None,
-    )
-    return used
-
-
-def write(folder: Path, summary: RunSummary, metrics_csv: str) -> None:
-    """Write `summary.json` and `metrics.csv` into a run's folder."""
     atomic_write(folder / run_folder.METRICS, metrics_csv)
+    if shown:
+        atomic_write(folder / run_folder.STEP_REWARDS, segments.to_csv(shown))
     run_summary.write(folder, summary)
 
 

@@ -17,6 +17,7 @@ def version_of(*distributions: str) -> str | None:
 def versions() -> dict[str, str | None]:
     """Versions of the software and hardware that decide the numbers of a run."""
     return {
+        'codetr_ros': version_of('codetr_ros'),
         'python': platform.python_version(),
         'numpy': version_of('numpy'),
         'torch': version_of('torch'),

@@ -1,0 +1,49 @@
+"""The course of a run: the numbers of its `metrics.csv` over training."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from codetr_ros.runs.folder import RunFolderError
+
+Points = Sequence[tuple[float, float]]
+"""Environment steps, and the value of a number then."""
+
+LOSSES = (
+    *('reward_loss', 'state_loss', 'history_loss', 'meta_gradient_norm'),
+    *('critic_loss', 'extrinsic_value_loss', 'actor_loss', 'policy_loss'),
+)
+"""The metrics that are losses, of every method."""
+
+
+def read(path: Path) -> dict[str, Points]:
+    """The columns of a `metrics.csv`, without cells that are empty.
+
+    Raises:
+        RunFolderError: it cannot be read, or is not a run's.
+    """
+    columns: dict[str, list[tuple[float, float]]] = {}
+    try:
+        with path.open(newline='') as file:
+            for row in csv.DictReader(file):
+                step = float(row.pop('step'))
+                for name, value in row.items():
+                    if value:
+                        columns.setdefault(name, []).append((step, float(value)))
+    except (OSError, KeyError, ValueError, TypeError, AttributeError) as error:
+        raise RunFolderError(
+            f'{path} is not the table of a run ({error}): remove it, a report can do without it'
+        ) from None
+    return dict(columns)
+
+
+def losses(columns: Mapping[str, Points]) -> dict[str, Points]:
+    """The losses that a run has, by their names in words."""
+    shown = {}
+    for metric in LOSSES:
+        named = {name: points for name, points in columns.items() if name.endswith(f'.{metric}')}
+        for name, points in named.items():
+            words = metric.replace('_', ' ')
+            # several nodes of a role: the column names the node
+            shown[words if len(named) == 1 else f'{words} of {name.partition(".")[0]}'] = points
+    return shown

@@ -1,0 +1,139 @@
+"""What a run came to, in words and few numbers, for the page and the terminal."""
+
+from collections.abc import Sequence
+
+from codetr_ros.runs.numbers import column, number
+from codetr_ros.runs.run_summary import RewardRecovery, RunSummary
+
+
+def title(summary: RunSummary) -> str:
+    """Names the run in a line."""
+    s = summary
+    what = f'{s.task}, {s.composite} of {s.delay} steps, {s.method}, seed {s.seed}'
+    return what + (' (interrupted)' if s.interrupted else '')
+
+
+def result_rows(summary: RunSummary) -> list[tuple[str, str]]:
+    """The few numbers that people look for first, for the page and the terminal."""
+
+    def shown(value: float | None, form: str) -> str:
+        return 'not evaluated' if value is None else format(value, form)
+
+    last = summary.evaluations[-1] if summary.evaluations else None
+    spread = f' +- {last.true_return_std:.1f}' if last and last.true_return_std is not None else ''
+    after = f' after {last.step} steps' if last else ''
+    return [
+        ('score', f'{shown(summary.final_score, ".3f")}{after}'),
+        ('score of the random policy', shown(summary.random_score, '.3f')),
+        ('true return', f'{shown(summary.final_true_return, ".1f")}{spread}'),
+        ('true return of the random policy', shown(summary.random_true_return, '.1f')),
+        ('reward recovery', _recovery(summary)),
+        ('steps', f'{summary.steps} of {summary.steps_planned}'),
+        ('phases', f'{summary.phases} of {summary.phases_planned}'),
+        ('time', f'{summary.wall_s:.1f} s, {summary.steps_per_s or 0:.0f} steps per second'),
+        (
+            'messages',
+            f'{sum(row.published for row in summary.messages.values())} published, '
+            f'{summary.lost} lost, {summary.duplicated} duplicated, {summary.refused} refused',
+        ),
+    ]
+
+
+def _recovery(summary: RunSummary) -> str:
+    """The agreement of step rewards with the true ones at the last comparison."""
+    rows, evaluations = summary.reward_recovery, summary.evaluations
+    if not rows:
+        return 'no labels were compared'
+    last = rows[-1]
+    values = {'correlation': last.pearson, 'within segments': last.within}
+    shown = [f'{name} {value:.2f}' for name, value in values.items() if value is not None]
+    late = bool(evaluations) and evaluations[-1].step != last.step
+    after = f', after {last.step} steps' if late else ''
+    return (', '.join(shown) or 'not defined where one side does not vary') + after
+
+
+def learnt(summary: RunSummary) -> str:
+    """What the policy learnt, in a sentence; empty text if it was not evaluated."""
+    last, random = summary.final_true_return, summary.random_true_return
+    if last is None:
+        return ''
+    score = f', a score of {summary.final_score:.3f}' if summary.final_score is not None else ''
+    values = column([last, random])
+    than = f' The random policy earns {values[1]}.' if random is not None else ''
+    return (
+        f'After {summary.evaluations[-1].step} steps the policy earns {values[0]} an episode'
+        f'{score}.{than}'
+    )
+
+
+_GRADES = (
+    (0.9, 'The inferred rewards single out the steps that matter almost as the true ones do.'),
+    (0.6, 'The inferred rewards mostly single out the steps that matter.'),
+    (0.3, 'The inferred rewards single out the steps that matter in part.'),
+    (0.1, 'The inferred rewards hardly single out the steps that matter.'),
+    (-1.0, 'The inferred rewards do not single out the steps that matter.'),
+)
+"""What a correlation within segments of at least so much means; the borders are our choice."""
+
+
+def recovery_text(rows: Sequence[RewardRecovery]) -> str:
+    """What the reward recovery of a run means, for people."""
+    known = [row for row in rows if row.within is not None]
+    if not known:
+        return (
+            'Inside segments nothing can be compared: the inferred or the true rewards do not '
+            'vary there. An even spread of each score, for example, tells no step from another.'
+        )
+    first, last = known[0], known[-1]
+    assert first.within is not None
+    assert last.within is not None
+    change = f'is {last.within:.2f} after {last.step} steps'
+    if len(known) > 1:
+        moved = last.within - first.within
+        verb = 'rose' if moved > 0.05 else 'fell' if moved < -0.05 else 'stayed'
+        place = 'about the same, ' if verb == 'stayed' else ''
+        change = (
+            f'{verb} {place}from {first.within:.2f} after {first.step} steps to {last.within:.2f} '
+            f'after {last.step}'
+        )
+    grade = next(text for least, text in _GRADES if last.within >= least)
+    return (
+        f'{grade} Their correlation with the true rewards inside segments {change}. '
+        '1 is perfect credit, 0 is none. The policy can be good where this is low: on some tasks '
+        'any reward for staying alive is enough.'
+    )
+
+
+def scale_text(summary: RunSummary) -> str:
+    """The scale of the inferred rewards beside that of the true ones; empty if not known."""
+    last = summary.reward_recovery[-1] if summary.reward_recovery else None
+    if last is None or last.inferred_mean is None or last.inferred_std is None:
+        return ''
+    text = (
+        f'Over the {last.steps} labelled steps in memory, an inferred reward is '
+        f'{number(last.inferred_mean)} +- {number(last.inferred_std)} (mean and standard '
+        f'deviation), a true one {number(last.true_mean)} +- {number(last.true_std)}.'
+    )
+    if summary.label_unit is None or summary.label_unit == 1:
+        return text
+    return (
+        f'{text} The policy learns from the inferred ones divided by '
+        f'{number(summary.label_unit)}, the root mean square score per step of the warm-up.'
+    )
+
+
+_BARS = ' ▁▂▃▄▅▆▇█'
+
+
+def sketch(values: Sequence[float], encoding: str | None) -> str:
+    """A learning curve in a line of text: one bar for each value, the highest full."""
+    bars = _BARS
+    try:
+        bars.encode(encoding or 'ascii')
+    except (UnicodeEncodeError, LookupError):
+        bars = ' .:-=+*#@'
+    low, high = min(values), max(values)
+    top = len(bars) - 1
+    if high == low:
+        return bars[1] * len(values)
+    return ''.join(bars[1 + round((v - low) / (high - low) * (top - 1))] for v in values)
