@@ -29,6 +29,7 @@ def memory(
     seed: int = 0,
     noise: float = 0.0,
     irregular: bool = False,
+    components: int = O,
 ) -> Trajectories:
     """One episode of whole segments, the step rewards in it too.
 
@@ -40,6 +41,7 @@ def memory(
         seed: of everything random.
         noise: deviation of what is added to each step's reward.
         irregular: lengths are drawn from half the delay on.
+        components: of an observation, O.
     """
     rng = np.random.default_rng(seed)
     lengths = np.full(segments, delay)
@@ -47,15 +49,17 @@ def memory(
         lengths = rng.integers(max(1, delay // 2), delay + 1, segments)
     steps = int(lengths.sum())
     # components that wander slowly, as states do
-    s = np.zeros((steps + 1, O))
+    s = np.zeros((steps + 1, components))
     for t in range(1, steps + 1):
-        s[t] = 0.9 * s[t - 1] + rng.normal(size=O) * 0.4
+        s[t] = 0.9 * s[t - 1] + rng.normal(size=components) * 0.4
     observations = s.astype(np.float32)
     actions = rng.uniform(-1, 1, (steps, A)).astype(np.float32)
     wide = observations.astype(np.float64)
     rewards = reward(wide[:-1], actions.astype(np.float64), wide[1:])
     rewards = (rewards + noise * rng.normal(size=steps)).astype(np.float32)
-    made = Trajectories(O, A, delay, steps + 1, 1000, true_rewards=True, regular=not irregular)
+    made = Trajectories(
+        components, A, delay, steps + 1, 1000, true_rewards=True, regular=not irregular
+    )
     made.append(
         builders.transitions(
             steps=steps, observations=observations, actions=actions, truncated=True

@@ -235,11 +235,27 @@ def test_moments_count_as_moved_from_the_stated_drift_on():
     assert held.moved(Moments(held.mean, np.array([2.0, 1 / (1 + 1.1 * DRIFT)])))
 
 
-def test_each_block_of_features_has_about_unit_norm():
+def test_each_kind_of_feature_has_about_unit_norm_and_each_component_is_a_block_of_its_own():
     features = Features(17, 6, seed=0)
     inputs = np.random.default_rng(1).normal(size=(4000, 40)).astype(np.float32)
-    norms = [float((features(inputs)[:, b] ** 2).sum(1).mean()) for b in features.blocks]
-    np.testing.assert_allclose(norms, 1, rtol=0.05)
+    squares = (features(inputs) ** 2).mean(0).numpy()
+    ends = np.cumsum([1, 17, 6, 17, 17, 6, 200, 200, 128, 128])[:-1]
+    np.testing.assert_allclose([x.sum() for x in np.split(squares, ends)], 1, rtol=0.05)
+    assert [b.stop - b.start for b in features.blocks] == [1] * 64 + [200, 200, 128, 128]
+
+
+def test_effects_are_changes_of_f_by_one_deviation_of_a_component():
+    features, rng = Features(3, 2, seed=0), np.random.default_rng(3)
+    weights = torch.tensor(rng.normal(size=features.size))
+    weights[features.blocks[-4].start :] = 0
+    weights[1 + 3 + 2 + 3 :] = 0  # no squares: f is linear
+    effects = features.effects(weights)
+    assert len(effects) == features.blocks[-4].start - 1
+    for column, name in enumerate(["s'[0]", "s'[1]", "s'[2]", 'a[0]', 'a[1]', "(s'-s)[0]"]):
+        inputs = np.zeros((2, 8), np.float32)
+        inputs[1, column] = 1
+        f = features(inputs).double() @ weights
+        assert effects[name] == pytest.approx(float(f[1] - f[0]), rel=1e-6)
 
 
 @pytest.mark.parametrize('block', range(4))
@@ -249,7 +265,7 @@ def test_products_of_fourier_features_are_the_gaussian_kernel_that_they_stand_fo
     sizes, lengths = (3, 3, 5, 8), (0.3, 0.7, 1.0, 1.0)
     products = []
     for features in made:
-        one, other = features(inputs)[:, features.blocks[6 + block]]
+        one, other = features(inputs)[:, features.blocks[block - 4]]
         products.append(float(one @ other))
     n = sizes[block]
     apart = ((inputs[0, :n] - inputs[1, :n]) ** 2).sum()

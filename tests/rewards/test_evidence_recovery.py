@@ -106,6 +106,24 @@ def test_within_long_segments_credit_goes_by_where_a_step_leads():
     assert planted.within(fitted(data, delay=250), data) > 0.97
 
 
+@pytest.mark.parametrize('seed', range(3))
+def test_few_scores_show_on_which_of_many_components_the_reward_depends(seed):
+    data = planted.memory(
+        lambda s, a, after: after[:, 8] - 0.1 * (a * a).sum(1),
+        lambda r: composite('max', r, 3.0, 100),
+        delay=100,
+        segments=40,
+        seed=seed,
+        components=20,
+    )
+    settings = builders.tiny(method='evidence', composite='max', beta=3.0, delay=100, seed=seed)
+    made = registry.make(settings, 20, A)
+    assert isinstance(made, Evidence)
+    made.prepare(data)
+    assert planted.within(made, data) > 0.9
+    assert str(made.report()['depends_on']).startswith("s'[8] +")
+
+
 def test_a_constant_score_is_spread_evenly():
     data = planted.memory(planted.progress, lambda r: 30.0, segments=40)
     labels = fitted(data, reward_unit='raw').label(everything(fitted(data), data))

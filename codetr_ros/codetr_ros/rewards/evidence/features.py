@@ -8,6 +8,11 @@ ends of a step are seen, as rewards are functions of both. Decided here:
 * The trial had s in the place of s'. The two span the same functions, but scores of long segments
   cannot tell them apart, as the changes s' - s add up to the last observation less the first. Then
   the prior decides, and rewards are mostly functions of where a step has led to.
+* Each feature that is a single component or its square has a variance of its own, so it is a block
+  of its own. Rewards depend on few quantities, and scores then show soon on which (automatic
+  relevance determination; MacKay, 1994; Neal, 1996). With one variance for all states, another
+  for all actions and so on, as in the trial, it took 80 to 100 scores of a soft maximum over 100
+  steps of HalfCheetah until credit within segments was above .9; now it takes 30 to 50.
 * Moments are those of the steps that are learnt from, and they are renewed only when they have
   moved by more than `DRIFT`, so that what was computed from them can be kept from phase to phase.
 """
@@ -81,12 +86,13 @@ def moments(total: F64, observation_size: int, action_size: int) -> Moments:
 
 
 class Features:
-    """Features phi (N, D) of steps, D = 1 + 3 O + 2 A + 656, in ten blocks.
+    """Features phi (N, D) of steps, D = 1 + 3 O + 2 A + 656.
 
-    1; s'; a; d = s' - s; squares of s' and of a; and random Fourier features
+    1; s'; a; d = s' - s; squares of s' and of a; and four blocks of random Fourier features
     sqrt(2/count) cos(W z + b), W ~ N(0, 1/(l^2 n)), of n inputs z (Rahimi and Recht, 2007), whose
-    sums of products are Gaussian kernels of length l sqrt(n). Each block has about unit norm, so
-    that the variance of its weights states how much of a reward it makes up.
+    sums of products are Gaussian kernels of length l sqrt(n). All s' together have about unit
+    norm, and so have all a and so on, so that the variances of weights state how much of a reward
+    they make up.
 
     Args:
         observation_size: O.
@@ -112,7 +118,10 @@ class Features:
         self.mean = torch.zeros(self.inputs, dtype=torch.float64)
         self.std = torch.ones(self.inputs, dtype=torch.float64)
         o, a = self._sizes
-        self.blocks = _slices([1, o, a, o, o, a, *(number for _, _, number in FOURIER)])
+        fourier = [number for _, _, number in FOURIER]
+        self._linear = _slices([1, o, a, o, o, a])[1:]
+        self.blocks = _slices([1] * self._linear[-1].stop + fourier)
+        """Features whose weights share the variance of their prior."""
         self.size = self.blocks[-1].stop
         amplitudes = [np.full(number, math.sqrt(2 / number)) for _, _, number in FOURIER]
         self._amplitudes = torch.tensor(np.concatenate(amplitudes).astype(np.float32))
@@ -121,6 +130,19 @@ class Features:
     def moments(self) -> Moments:
         """By which inputs are standardised."""
         return Moments(self.mean.numpy().copy(), self.std.numpy().copy())
+
+    def effects(self, weights: Tensor) -> dict[str, float]:
+        """By how much f changes with one deviation of each feature before the Fourier blocks.
+
+        Args:
+            weights: (D,).
+        """
+        o, a = self._sizes
+        kinds = (("s'[{}]", o), ('a[{}]', a), ("(s'-s)[{}]", o), ("s'[{}]^2", o), ('a[{}]^2', a))
+        names = [(kind.format(i), count) for kind, count in kinds for i in range(count)]
+        linear = weights[1 : 1 + len(names)].tolist()
+        pairs = zip(names, linear, strict=True)
+        return {name: weight / math.sqrt(count) for (name, count), weight in pairs}
 
     def renew(self, new: Moments) -> None:
         """Standardise by other moments from now on."""
@@ -138,7 +160,7 @@ class Features:
         o, a = self._sizes
         phi = torch.empty(len(z), self.size)
         s, u, d = z[:, :o], z[:, o : o + a], z[:, o + a :]
-        linear = self.blocks[1:6]
+        linear = self._linear
         phi[:, 0] = 1
         phi[:, linear[0]] = s / math.sqrt(o)
         phi[:, linear[1]] = u / math.sqrt(a)

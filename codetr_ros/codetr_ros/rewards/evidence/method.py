@@ -40,6 +40,9 @@ from codetr_ros.rewards.evidence.uncertainty import deviations
 from codetr_ros.seeding import generator
 from codetr_ros.system.states import check_state
 
+SHOWN = 5
+"""Features in a summary: those with which the step reward changes most."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Uncertainty:
@@ -231,15 +234,17 @@ class Evidence(Predictor):
         return known
 
     def report(self) -> ModelFacts:
-        """The link, how sure it is, and what the scales are, for a run's summary."""
+        """The link, how sure it is, and what rewards depend on most, for a run's summary."""
         if not self._fits:
             return {}
-        scales = np.exp(self._model.theta).tolist()
+        factor = self._model.scale / self.unit
+        effects = self._features.effects(self._model.posterior.mean)
+        most = sorted(effects, key=lambda name: -abs(effects[name]))[:SHOWN]
         return {
             **self.metrics(),
             'link': self._model.link.name,
             'link_is': 'chosen' if self._own.link == 'choose' else 'known',
-            'block_variances': scales[:-2],
+            'depends_on': ', '.join(f'{name} {effects[name] * factor:+.2g}' for name in most),
         }
 
     # ------------------------------------------------------------------------------------------

@@ -4,9 +4,10 @@ The formulas: docs/methods.md#evidence.
 
 From the trial: the noise, the closed form where the link is linear, else Gauss-Newton rounds with
 their number, steps and annealing, the learnt beta, and labels that explain each score. Decided
-here: after a first fit, the scales are learnt in the first round only.
+here: several annealings, and after a first fit, the scales are learnt in the first round only.
 """
 
+import copy
 import math
 from collections.abc import Sequence
 
@@ -22,12 +23,16 @@ from codetr_ros.rewards.evidence.regression import Posterior, noise, posterior, 
 from codetr_ros.rewards.evidence.sample import Sample
 from codetr_ros.rewards.evidence.scales import Evidence, Linear
 
-ROUNDS = (8, 3)
-"""Gauss-Newton rounds of a first fit and of later ones."""
+ROUNDS = (7, 3)
+"""Gauss-Newton rounds of a first fit, after its first one, and of later fits."""
 ITERATIONS = (40, 10)
 """Of the search for scales: at first, later."""
-HEATS = ((0.1, 3), (0.3, 3))
-"""A soft maximum is annealed at the first fit: its beta by such a factor, for so many rounds."""
+HEATS: tuple[tuple[float, ...], ...] = ((0.1, 0.3), (0.3,), ())
+"""A soft maximum is annealed at the first fit: its beta by such factors. Few scores may lead to a
+place that is not the best one, so there are several beginnings, of which the likeliest one stays.
+"""
+HEAT_ROUNDS = 3
+"""Rounds with each of them."""
 STEPS = (1.0, 0.5, 0.25)
 """Step lengths of Gauss-Newton, of which the best one is taken."""
 
@@ -102,22 +107,40 @@ class Model:
         self.left_out_r2 = 1 - float(residuals @ residuals) / total if total > 0 else 0.0
 
     def _rounds(self, sample: Sample, y: F64, places: Tensor) -> tuple[float, Tensor]:
-        """Gauss-Newton, from where it stands."""
-        link, cold = self.link, not self.fitted
-        result = (0.0, torch.zeros(0))
-        if cold:  # as if the score were a mean, to have somewhere to begin
-            result = self._round(sample, y, places, first=True)
-            self.fitted = True
-        if isinstance(link, SoftMax) and cold:
-            for link.heat, rounds in HEATS:
-                for _ in range(rounds):
-                    self._round(sample, y, places)
-            link.heat = 1.0
-        rounds = ROUNDS[0] - 1 if cold else ROUNDS[1]
-        for number in range(rounds):
-            last = number == rounds - 1
-            result = self._round(sample, y, places, learn=cold or number == 0, last=last)
+        """Gauss-Newton, from where it stands, or from the best of several beginnings."""
+        if self.fitted:
+            return self._further(sample, y, places, ROUNDS[1])
+        soft = isinstance(self.link, SoftMax)
+        before, begun = (self.link, self.theta, self.posterior), []
+        for heats in HEATS if soft else HEATS[-1:]:
+            self.fitted = False
+            self.link, self.theta, self.posterior = copy.copy(before[0]), *before[1:]
+            result = self._begin(sample, y, places, heats)
+            begun.append((result, (self.link, self.theta, self.posterior)))
+        result, after = max(begun, key=lambda one: one[0][0])
+        self.link, self.theta, self.posterior = after
         return result
+
+    def _begin(
+        self, sample: Sample, y: F64, places: Tensor, heats: Sequence[float]
+    ) -> tuple[float, Tensor]:
+        """A first fit: at first as if the score were a mean, then annealed."""
+        self._round(sample, y, places, first=True)
+        self.fitted = True
+        if isinstance(self.link, SoftMax):
+            for self.link.heat in heats:
+                for _ in range(HEAT_ROUNDS):
+                    self._round(sample, y, places)
+            self.link.heat = 1.0
+        return self._further(sample, y, places, ROUNDS[0], learn=True)
+
+    def _further(
+        self, sample: Sample, y: F64, places: Tensor, rounds: int, learn: bool = False
+    ) -> tuple[float, Tensor]:
+        """Some rounds, in the first of which the scales are learnt, or in all of them."""
+        for number in range(rounds - 1):
+            self._round(sample, y, places, learn=learn or number == 0)
+        return self._round(sample, y, places, learn=learn or rounds == 1, last=True)
 
     def _round(
         self,

@@ -105,19 +105,27 @@ class Evidence:
 
     def __init__(self, data: Linear, blocks: Sequence[slice]) -> None:
         self._spread, self._targets = data.spread, data.targets
-        self._kernels = torch.stack(
-            [(data.rows[:, b] @ data.rows[:, b].T).reshape(-1) for b in blocks]
+        wide = [b for b in blocks if b.stop - b.start > 1]
+        self._is_single = np.array([b.stop - b.start == 1 for b in blocks])
+        self._single = data.rows[:, [b.start for b in blocks if b.stop - b.start == 1]]
+        kernels = [(data.rows[:, b] @ data.rows[:, b].T).reshape(-1) for b in wide]
+        self._kernels = (
+            torch.stack(kernels)
+            if wide
+            else torch.zeros(0, len(data.rows) ** 2, dtype=torch.float64)
         )
         self._fixed = None if data.known is None else torch.outer(data.known, data.known)
         self._centre = centre(len(blocks))
 
     def _factor(self, theta: F64) -> Tensor:
         size = len(self._targets)
-        scales = torch.tensor(np.exp(theta))
-        kernel = (scales[:-2] @ self._kernels).view(size, size)
+        scales = np.exp(theta)
+        narrow = self._single * torch.tensor(scales[:-2][self._is_single])
+        kernel = torch.tensor(scales[:-2][~self._is_single]) @ self._kernels
+        kernel = kernel.view(size, size) + narrow @ self._single.T
         if self._fixed is not None:
             kernel = kernel + self._fixed
-        kernel.diagonal().add_(scales[-2] * self._spread + scales[-1] + JITTER)
+        kernel.diagonal().add_(float(scales[-2]) * self._spread + float(scales[-1]) + JITTER)
         return cholesky(kernel)
 
     def __call__(self, theta: F64) -> tuple[float, F64]:
@@ -129,12 +137,11 @@ class Evidence:
         scales = np.exp(theta)
         off = theta - self._centre
         value = 0.5 * float(self._targets @ explained) + float(factor.diagonal().log().sum())
-        slope = [
-            *(self._kernels @ inner.reshape(-1)).tolist(),
-            float(inner.diagonal() @ self._spread),
-            float(inner.diagonal().sum()),
-        ]
-        gradient: F64 = 0.5 * scales * np.array(slope) + off / PRIOR_VARIANCE
+        slope = np.empty(len(theta))
+        slope[:-2][self._is_single] = (self._single * (inner @ self._single)).sum(0).numpy()
+        slope[:-2][~self._is_single] = (self._kernels @ inner.reshape(-1)).numpy()
+        slope[-2:] = float(inner.diagonal() @ self._spread), float(inner.diagonal().sum())
+        gradient: F64 = 0.5 * scales * slope + off / PRIOR_VARIANCE
         return value + float(off @ off) / (2 * PRIOR_VARIANCE), gradient
 
     def left_out(self, theta: F64) -> Tensor:
