@@ -60,6 +60,7 @@ VARIANTS: dict[str, dict[str, object]] = {
     'method rbt, segment scope': {'method': 'rbt', 'rbt.attention_scope': 'segment'},
     'method rrd biased': {'method': 'rrd'},
     'method rrd unbiased': {'method': 'rrd', 'rrd.loss': 'unbiased'},
+    'method diaster': {'method': 'diaster'},
     'method lrr': {'method': 'lrr'},
     'method lrr, independent steps': {'method': 'lrr', 'lrr.correlation': 'none'},
     'method mlp': {'method': 'mlp'},

@@ -29,6 +29,7 @@ CASES = [
     (PENDULUM, 'uniform', 'overlap'),
     (REACHER, 'random', 'lock-step'),
     (PENDULUM, 'lrr', 'lock-step'),
+    (REACHER, 'diaster', 'overlap'),
     (REACHER, 'evidence', 'lock-step'),
     (PENDULUM, 'evidence', 'overlap'),
 ]

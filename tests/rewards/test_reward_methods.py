@@ -306,6 +306,10 @@ class TestRrdUnbiased(TestRrd):
     changes: ClassVar[dict[str, Any]] = {'rrd__loss': 'unbiased'}
 
 
+class TestDiaster(PerceptronContract):
+    method = 'diaster'
+
+
 class TestLrr(PerceptronContract):
     method = 'lrr'
 

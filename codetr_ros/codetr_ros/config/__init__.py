@@ -13,6 +13,7 @@ from codetr_ros.config.loading import (
 )
 from codetr_ros.config.methods import (
     CodetrSettings,
+    DiasterSettings,
     HcSettings,
     LirpgSettings,
     LrrSettings,
@@ -30,6 +31,7 @@ __all__ = [
     'SCORE_LEARNERS',
     'CodetrSettings',
     'Composite',
+    'DiasterSettings',
     'Group',
     'HcSettings',
     'LirpgSettings',

@@ -174,6 +174,27 @@ class RrdSettings(PerceptronSettings):
     )
 
 
+class DiasterSettings(PerceptronSettings):
+    """Difference of sub-trajectory rewards (Lin et al., arXiv 2312.10642)."""
+
+    width: int = Field(
+        256, ge=1, le=65536, description='width of the GRU that gives runs of steps their worth'
+    )
+    batch: int = Field(
+        64, ge=1, le=65536, description='segments in a gradient step, drawn by their lengths'
+    )
+    first_gradient_steps: int = Field(
+        1000, ge=0, le=10**6, description='gradient steps after the last warm-up phase'
+    )
+    gradient_steps: int = Field(
+        1000,
+        ge=0,
+        le=10**6,
+        description='gradient steps after every later phase; published: as many as an episode '
+        'has steps, in every 1000 environment steps',
+    )
+
+
 class LrrSettings(PerceptronSettings):
     """Likelihood reward redistribution (Xiao and Yu, arXiv 2503.17409)."""
 

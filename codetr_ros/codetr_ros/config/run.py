@@ -16,6 +16,7 @@ from pydantic import Field, model_validator
 from codetr_ros.config.base import Group, SettingsError, flatten, validate
 from codetr_ros.config.methods import (
     CodetrSettings,
+    DiasterSettings,
     EvidenceSettings,
     HcSettings,
     LirpgSettings,
@@ -47,6 +48,7 @@ Method = Literal[
     'rbt',
     'rrd',
     'ircr',
+    'diaster',
     'lrr',
     'hc',
     'lirpg',
@@ -178,6 +180,9 @@ class Settings(Schedule, Group):
     )
     rrd: RrdSettings = Field(
         default_factory=RrdSettings, description='randomized return decomposition'
+    )
+    diaster: DiasterSettings = Field(
+        default_factory=DiasterSettings, description='differences of sub-trajectory rewards'
     )
     lrr: LrrSettings = Field(
         default_factory=LrrSettings, description='likelihood reward redistribution'

@@ -3,6 +3,7 @@
 from codetr_ros.config import Settings
 from codetr_ros.rewards.base import RewardMethod, RewardModelError
 from codetr_ros.rewards.codetr import Codetr
+from codetr_ros.rewards.diaster import Diaster
 from codetr_ros.rewards.evidence.method import Evidence
 from codetr_ros.rewards.ircr import Ircr
 from codetr_ros.rewards.lrr import Lrr
@@ -19,6 +20,7 @@ METHODS: dict[str, type[RewardMethod]] = {
         Rbt,
         Rrd,
         Ircr,
+        Diaster,
         Lrr,
         Mlp,
         Evidence,
