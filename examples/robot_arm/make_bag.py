@@ -5,6 +5,9 @@
 A made-up arm of two joints gets a velocity command about ten times a second, reports its joints
 fifty times a second, and is scored every two seconds: how near was its hand to the target? Each
 attempt lasts eight seconds and ends with a message. Times jitter, as they do.
+
+With `--verdicts` a person also judges each attempt as a whole. That takes four to eight seconds,
+and the next attempt begins after three. Every fifth verdict is corrected a second later.
 """
 
 import argparse
@@ -19,6 +22,7 @@ from rosbags.typesys import Stores, get_typestore
 NS = 10**9
 BEGIN = 1_700_000_000 * NS  # when the recording begins
 SECONDS = 8.0  # of an attempt
+PAUSE = 3.0  # [s] between two attempts
 TARGET = np.array([0.5, 1.2])  # [m]
 FASTEST = np.array([1.5, 2.0])  # [rad/s] of shoulder and elbow
 
@@ -50,6 +54,16 @@ def attempt(rng: np.random.Generator, begin: int) -> Iterator[tuple[int, str, An
     yield begin + round(SECONDS * NS), '/arm/attempt_ended', None
 
 
+def verdicts(rng: np.random.Generator, number: int, begin: int) -> Iterator[tuple[int, str, Any]]:
+    """Time [ns], topic and value of the verdict on an attempt, and of its correction."""
+    now = begin + round((SECONDS + rng.uniform(4, 8)) * NS)
+    grade = float(rng.integers(1, 6))
+    if number % 5 == 4:
+        yield now, '/judge/verdict', -grade  # a slip of the finger
+        now += NS
+    yield now, '/judge/verdict', grade
+
+
 def message(store: Any, topic: str, value: Any, now: int) -> Any:
     """The message that a topic carries."""
     types = store.types
@@ -68,7 +82,7 @@ def message(store: Any, topic: str, value: Any, now: int) -> Any:
     if topic == '/arm/velocity_commands':
         layout = types['std_msgs/msg/MultiArrayLayout']([], 0)
         return types['std_msgs/msg/Float64MultiArray'](layout, value)
-    if topic == '/judge/score':
+    if topic in ('/judge/score', '/judge/verdict'):
         return types['std_msgs/msg/Float64'](value)
     return types['std_msgs/msg/Empty'](0)
 
@@ -78,18 +92,24 @@ def write(
     attempts: int = 30,
     seed: int = 0,
     storage: StoragePlugin = StoragePlugin.MCAP,
+    judged: bool = False,
 ) -> None:
-    """Write the bag."""
+    """Write the bag; `judged` adds the verdicts."""
     rng, store = np.random.default_rng(seed), get_typestore(Stores.ROS2_JAZZY)
+    person = np.random.default_rng([seed, 1])
+    messages = []
+    for n in range(attempts):
+        begin = BEGIN + round(n * (SECONDS + PAUSE) * NS)
+        messages += attempt(rng, begin)
+        messages += verdicts(person, n, begin) if judged else ()
     connections: dict[str, Any] = {}
     with Writer(folder, version=9, storage_plugin=storage) as bag:
-        for n in range(attempts):
-            for now, topic, value in attempt(rng, BEGIN + round(n * (SECONDS + 3) * NS)):
-                made = message(store, topic, value, now)
-                kind = made.__msgtype__
-                if topic not in connections:
-                    connections[topic] = bag.add_connection(topic, kind, typestore=store)
-                bag.write(connections[topic], now, store.serialize_cdr(made, kind))
+        for now, topic, value in sorted(messages, key=lambda one: one[0]):
+            made = message(store, topic, value, now)
+            kind = made.__msgtype__
+            if topic not in connections:
+                connections[topic] = bag.add_connection(topic, kind, typestore=store)
+            bag.write(connections[topic], now, store.serialize_cdr(made, kind))
 
 
 def main() -> None:
@@ -98,8 +118,9 @@ def main() -> None:
     parser.add_argument('folder', type=Path, help='the new bag')
     parser.add_argument('--attempts', type=int, default=30)
     parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--verdicts', action='store_true', help='with a verdict on each attempt')
     given = parser.parse_args()
-    write(given.folder, given.attempts, given.seed)
+    write(given.folder, given.attempts, given.seed, judged=given.verdicts)
 
 
 if __name__ == '__main__':

@@ -10,10 +10,11 @@ import pytest
 from codetr_ros.bags.errors import Place
 from codetr_ros.bags.reader import Message
 from codetr_ros.config import SettingsError, validate
-from codetr_ros.offline import converting, episode_scores, mapping
+from codetr_ros.offline import conversion, converting, mapping
 from codetr_ros.offline.converting import Converter
 from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.mapping import Mapping
+from codetr_ros.offline.message_fields import NS
 from codetr_ros.records import CompositeReward, Transitions
 
 PLACE = Place(Path('bag'), 0)
@@ -31,7 +32,7 @@ def rules(**changes: Any) -> Mapping:
 
 def said(at: float, topic: str, value: Any = None) -> Message:
     """A message received at a time [s]."""
-    time = round(at * converting.NS)
+    time = round(at * NS)
     return Message('x/msg/X', SimpleNamespace(data=value), topic, time, time, PLACE)
 
 
@@ -137,7 +138,7 @@ def test_a_last_step_after_which_nothing_was_observed_is_dropped():
     assert scores == [(0, 0, 1, 2.0)]
     assert dict(converter.conversion.dropped) == {
         converting.NO_NEXT: 1,
-        episode_scores.SCORE_TRIMMED: 1,
+        conversion.SCORE_TRIMMED: 1,
     }
 
 
@@ -171,7 +172,7 @@ def test_what_is_not_finite_is_no_step():
     assert [s[2] for s in steps] == [[1.0, 1.1], [1.3, 1.4]]
     assert scores == []
     assert converter.conversion.dropped[converting.NOT_FINITE] == 1
-    assert converter.conversion.dropped[episode_scores.SCORE_NOT_FINITE] == 1
+    assert converter.conversion.dropped[conversion.SCORE_NOT_FINITE] == 1
 
 
 def test_several_topics_are_one_observation_once_each_has_been_heard():
@@ -247,13 +248,13 @@ def test_a_score_may_be_of_the_last_steps_that_are_not_scored_yet():
         said(1.46, '/state', [0.0]),
     )
     assert scores == [(0, 1, 2, 2.0), (0, 3, 2, 4.0)]
-    assert converter.conversion.dropped[episode_scores.SCORE_OF_NOTHING] == 1
-    assert converter.conversion.dropped[episode_scores.SCORE_AGAIN] == 1
+    assert converter.conversion.dropped[conversion.SCORE_OF_NOTHING] == 1
+    assert converter.conversion.dropped[conversion.SCORE_AGAIN] == 1
 
 
 def test_an_episode_of_which_nothing_is_left_leaves_no_gap_in_the_numbers():
     steps, scores, converter = run(
-        rules(),
+        rules(score={'topic': '/score', 'late': 0.0}),
         *commands(1.0, 1.1),
         said(1.15, '/state', [0.0]),
         said(1.2, '/end'),
@@ -265,7 +266,7 @@ def test_an_episode_of_which_nothing_is_left_leaves_no_gap_in_the_numbers():
     )
     assert [s[0] for s in steps] == [0, 1]
     assert scores == [(1, 0, 1, 1.0)]
-    assert converter.conversion.dropped[episode_scores.SCORE_DROPPED] == 1
+    assert converter.conversion.dropped[conversion.SCORE_DROPPED] == 1
 
 
 def test_long_episodes_come_in_chunks_that_join(monkeypatch):

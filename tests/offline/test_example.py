@@ -64,6 +64,34 @@ def test_the_arms_bag_becomes_steps_a_model_and_labels(make_bag, tmp_path, capsy
     assert sum(map(len, labels)) == 960
 
 
+def test_a_verdict_is_of_its_attempt_although_it_comes_during_the_next_one(
+    make_bag, tmp_path, capsys
+):
+    make_bag.write(tmp_path / 'arm', 11, judged=True)
+    verdicts = list(Bag(tmp_path / 'arm').messages(topics=['/judge/verdict']))
+    length = round((make_bag.SECONDS + make_bag.PAUSE) * make_bag.NS)
+    during = [(m.log_time - make_bag.BEGIN) // length for m in verdicts]  # this attempt
+    last = {number - 1: m.message.data for number, m in zip(during, verdicts, strict=True)}
+
+    convert(tmp_path / 'arm', tmp_path / 'steps', ARM / 'verdicts.yaml')
+
+    scores = [e.record for e in Bag(tmp_path / 'steps').entries((CompositeReward,))]
+    assert {s.episode: s.value for s in scores} == last
+    assert [(s.first_step, s.length) for s in scores] == [(0, 80)] * 11
+    said = capsys.readouterr().out
+    assert '11, of 880 steps together, 80 each' in said
+    assert 'dropped     2 scores that a later score of the same steps replaced' in said
+
+    # by their reception they may be of either attempt
+    plain = tmp_path / 'plain.yaml'
+    plain.write_text((ARM / 'mapping.yaml').read_text().replace('/judge/score', '/judge/verdict'))
+    convert(tmp_path / 'arm', tmp_path / 'none', plain)
+    assert not list(Bag(tmp_path / 'none').entries((CompositeReward,)))
+    said = capsys.readouterr().out
+    assert f'dropped     {len(verdicts)} scores that may be of the episode before' in said
+    assert 'Give score.late: 0 if scores never come after the next episode has begun' in said
+
+
 def test_a_mapping_of_topics_that_are_not_there_names_those_that_are(make_bag, tmp_path, capsys):
     make_bag.write(tmp_path / 'arm', 1)
     text = (ARM / 'mapping.yaml').read_text()

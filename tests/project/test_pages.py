@@ -185,19 +185,27 @@ def test_the_layers_on_the_page_are_those_that_imports_are_held_to():
     assert shown == held
 
 
-def quoted_yaml(page: str, tmp_path: Path) -> Path:
-    (text,) = re.findall(r'```yaml\n(.*?)```', (ROOT / page).read_text(), re.DOTALL)
+def quoted_yaml(page: str, tmp_path: Path) -> tuple[Path, list[str]]:
+    """A file of the first YAML that a page shows, and the other YAML that it shows."""
+    text, *more = re.findall(r'```yaml\n(.*?)```', (ROOT / page).read_text(), re.DOTALL)
     file = tmp_path / 'quoted.yaml'
     file.write_text(text)
-    return file
+    return file, more
 
 
 def test_the_spec_and_the_mapping_that_pages_show_are_accepted(tmp_path: Path):
     from codetr_ros.benchmark import spec
     from codetr_ros.offline import mapping
 
-    assert len(spec.load(quoted_yaml('docs/benchmarks.md', tmp_path)).cells) == 4 * 2 * 3
-    assert mapping.load(quoted_yaml('docs/other-peoples-data.md', tmp_path)).source == 'arm'
+    assert len(spec.load(quoted_yaml('docs/benchmarks.md', tmp_path)[0]).cells) == 4 * 2 * 3
+    file, more = quoted_yaml('docs/other-peoples-data.md', tmp_path)
+    assert mapping.load(file).source == 'arm'
+    whole = yaml.safe_load(file.read_text())
+    parts = [part for text in more for part in yaml.safe_load_all(text)]
+    assert len(parts) >= 5
+    for part in parts:
+        file.write_text(yaml.safe_dump(whole | part))
+        assert mapping.load(file).score.of == part['score'].get('of', 'since_last')
 
 
 def test_the_readme_is_one_page():

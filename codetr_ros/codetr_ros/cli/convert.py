@@ -35,6 +35,7 @@ def main(arguments: Sequence[str]) -> int:
     given = tyro.cli(Arguments, prog='codetr convert', args=arguments)
     from codetr_ros.bags.reader import Bag
     from codetr_ros.offline import mapping
+    from codetr_ros.offline.conversion import HINTS
     from codetr_ros.offline.converted_bag import convert
 
     try:
@@ -44,16 +45,22 @@ def main(arguments: Sequence[str]) -> int:
         return refuse(str(error))
     read = ', '.join(f'{n} of {topic}' for topic, n in sorted(made.messages.items()))
     lost = ', '.join(f'{n} {what}' for what, n in made.dropped.items())
+    each = f'{made.fewest}' if made.fewest == made.most else f'{made.fewest} to {made.most}'
     rows = {
         'messages': read,
         'sizes': f'{made.sizes[0]} observations, {made.sizes[1]} actions',
         'episodes': f'{made.episodes}, {made.steps} steps of '
         f'{made.shortest:.3g} to {made.longest:.3g} s',
-        'scores': f'{made.scores}, of {made.scored_steps} steps together',
+        'scores': f'{made.scores}, of {made.scored_steps} steps together, {each} each'
+        if made.scores
+        else 'none',
         'dropped': lost or 'nothing',
         'output': given.out,
     }
     console = Console(highlight=False, soft_wrap=True)
     for name, text in rows.items():
         console.print(f'{name:<12}{text}', markup=False)
+    for what, hint in HINTS.items():
+        if what in made.dropped:
+            console.print(f'{"hint":<12}{what}: {hint}', markup=False)
     return 0

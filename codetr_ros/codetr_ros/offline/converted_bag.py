@@ -9,8 +9,8 @@ from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.topics import BagTopic
 from codetr_ros.bags.unfinished import unfinished
 from codetr_ros.bags.writer import McapWriter
+from codetr_ros.offline.conversion import Conversion
 from codetr_ros.offline.converting import Converter, Timed
-from codetr_ros.offline.episode_scores import Conversion
 from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.mapping import Mapping
 from codetr_ros.records import TOPICS, CompositeReward, Transitions

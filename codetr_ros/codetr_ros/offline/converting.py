@@ -23,12 +23,12 @@ import numpy as np
 
 from codetr_ros.bags.reader import Message
 from codetr_ros.offline import mapping
-from codetr_ros.offline.episode_scores import Conversion, EpisodeScores
+from codetr_ros.offline.conversion import Conversion
+from codetr_ros.offline.episode_scores import EpisodeScores
 from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.mapping import Mapping
+from codetr_ros.offline.message_fields import NS, field
 from codetr_ros.records import F32, F64, MESSAGE_BYTES, CompositeReward, Transitions
-
-NS = 10**9
 
 NO_OBSERVATION = 'samples without an observation within max_age'
 NOT_FINITE = 'samples that are not finite'
@@ -75,6 +75,7 @@ class Converter:
         self._episode = -1
         self._open = False
         self._written = 0  # steps of the episode that were written
+        self._cut: int | None = None  # when steps of an episode were lost last, as it went on
         self._scores = EpisodeScores(rules, run_id, self.conversion)
         self._sequence = 0
 
@@ -85,6 +86,7 @@ class Converter:
         self._now = max(self._now, message.log_time)
         self.conversion.messages[message.topic] += 1
         yield from self._until(self._now)
+        self._scores.advance(self._now)
         self._look()
         for i, values in enumerate(self._rules.observation):
             if values.topic == message.topic:
@@ -96,19 +98,18 @@ class Converter:
             if array is not None:
                 yield from self._commanded(array)
         if message.topic == self._rules.score.topic:
-            self._scores.take(message)
+            self._scores.take(message, self._now)
         if message.topic == self._rules.episode.topic and self._ends(message):
-            yield from self._end(self._rules.episode.terminal)
+            yield from self._end(self._now, self._rules.episode.terminal)
+            self._scores.name_episode(message)
+            self._cut = None
 
     def finish(self) -> Iterator[Timed]:
         """End the last episode; yields its records."""
         yield from self._until(self._now + 1)
-        yield from self._end(False)
-        yield from self._give_scores()
-
-    def _give_scores(self) -> Iterator[Timed]:
-        """Yield the scores of the ended episode, once no more can come."""
-        for score in self._scores.give(self._episode, self._written):
+        yield from self._end(None)
+        self._scores.advance(self._now + 1)
+        for score in self._scores.finish():
             yield score, self._now
 
     def _numbers(self, message: Message, values: mapping.Values) -> F64 | None:
@@ -122,7 +123,7 @@ class Converter:
         rule = self._rules.episode
         if rule.field is None:
             return True
-        return bool(mapping.field(message.message, rule.field, message.topic) == rule.equals)
+        return bool(field(message.message, rule.field, message.topic) == rule.equals)
 
     # ------------------------------------------------------------------------------------------
     # steps
@@ -138,7 +139,7 @@ class Converter:
                     assert self._rules.sampling.rate is not None
                     self._tick += round(NS / self._rules.sampling.rate)
             elif over < now:
-                yield from self._end(False)
+                yield from self._end(None)
             else:
                 return
 
@@ -166,13 +167,12 @@ class Converter:
     def _begin(self, now: int, command: F64) -> Iterator[Timed]:
         """Begin a step."""
         observation = self._observed(now, self._held)
-        if observation is None:
-            self.conversion.dropped[NO_OBSERVATION] += 1
-            yield from self._end(False)
-            return
-        if not (_finite(observation) and _finite(command)):
-            self.conversion.dropped[NOT_FINITE] += 1
-            yield from self._end(False)
+        if observation is None or not (_finite(observation) and _finite(command)):
+            lost = NO_OBSERVATION if observation is None else NOT_FINITE
+            self.conversion.dropped[lost] += 1
+            if self._open or self._cut is not None:
+                self._cut = now
+            yield from self._end(now)
             return
         action = self._scaled(command)
         self._check_sizes(len(observation), len(action))
@@ -182,14 +182,16 @@ class Converter:
             self.conversion.longest = max(self.conversion.longest, self._seconds / NS)
             yield from self._complete(observation)
         elif not self._open:
-            yield from self._give_scores()
             self._open = True
             self._episode += 1
             self._written = 0
-            self._scores.begin_episode()
+            continues = self._cut is not None and now - self._cut <= self._rules.episode.gap * NS
+            self._cut = None
+            for score in self._scores.begin_episode(self._episode, now, continues):
+                yield score, self._now
         self._pending = _Step(now, observation, action)
         self._then = None
-        self._scores.step_begun()
+        self._scores.step_begun(now)
 
     def _complete(self, observation: F64) -> Iterator[Timed]:
         """Complete the pending step with its next observation."""
@@ -201,8 +203,13 @@ class Converter:
         self._last = observation
         self._pending = None
 
-    def _end(self, terminal: bool) -> Iterator[Timed]:
-        """End the episode, if there is one."""
+    def _end(self, now: int | None, terminal: bool = False) -> Iterator[Timed]:
+        """End the episode, if there is one.
+
+        Args:
+            now: when it ends [ns]; when its last step began, if None.
+            terminal: whether its end is a terminal state.
+        """
         pending, self._command, self._tick = self._pending, None, None
         if pending is not None:
             self._look()
@@ -222,6 +229,7 @@ class Converter:
             self._episode -= 1  # no step of it is left
         self._open = False
         self._seconds = 0
+        self._scores.end_episode(now)
 
     def _scaled(self, command: F64) -> F64:
         low, high = np.asarray(self._rules.action.low), np.asarray(self._rules.action.high)

@@ -1,121 +1,230 @@
-"""Scores of an episode that is being converted: find the steps of each, and keep or drop it.
+"""Scores of episodes that are being converted: keep each until its steps are sure.
 
-A score is of steps that began before it or with it. It belongs to the current episode, or to the
-last one while no new one has begun. A score of all steps since the last score loses a step where
-the last step was dropped. Everything that is dropped is counted.
+An ended episode is held for as long as a score of it may come, which the mapping defines. Which
+steps a score is of is found in `score_booking`. Everything that is dropped is counted.
 """
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from codetr_ros.bags.reader import Message
-from codetr_ros.offline import mapping
-from codetr_ros.offline.errors import FitError
+from codetr_ros.offline import conversion
+from codetr_ros.offline.conversion import Conversion
 from codetr_ros.offline.mapping import Mapping
+from codetr_ros.offline.message_fields import NS, moment, name_in, number
+from codetr_ros.offline.score_booking import Booking, Held, Verdict
+from codetr_ros.offline.scored_episode import ScoredEpisode
 from codetr_ros.records import CompositeReward
-
-SCORE_NOT_FINITE = 'scores that are not finite'
-SCORE_OF_NOTHING = 'scores of no step, or of fewer than are asked for'
-SCORE_AGAIN = 'scores of steps that were scored before'
-SCORE_DROPPED = 'scores of steps that were dropped'
-SCORE_TRIMMED = 'scores whose last step was dropped, taken as of those before it'
-
-
-@dataclass
-class Conversion:
-    """The counts of a conversion."""
-
-    messages: Counter[str] = field(default_factory=Counter)  # read, by topic
-    episodes: int = 0
-    steps: int = 0
-    scores: int = 0
-    scored_steps: int = 0
-    dropped: Counter[str] = field(default_factory=Counter)
-    sizes: tuple[int, int] = (0, 0)  # of observations and actions
-    shortest: float = float('inf')  # [s] between the begins of two steps
-    longest: float = 0.0
 
 
 class EpisodeScores:
-    """Holds the scores of an episode until no more can come.
+    """Holds episodes and their scores until no more can come.
 
     Args:
         rules: the mapping.
         run_id: of the records.
-        conversion: counts scores, and those that are dropped.
+        made: counts scores, and those that are dropped.
     """
 
-    def __init__(self, rules: Mapping, run_id: str, conversion: Conversion) -> None:
+    def __init__(self, rules: Mapping, run_id: str, made: Conversion) -> None:
         self._rules = rules
+        self._rule = rules.score
         self._run_id = run_id
-        self._conversion = conversion
-        self._begun = 0  # steps of the episode that have begun, without dropped ones
-        self._scored = 0  # its steps before this one have had their score
-        self._held: list[tuple[int, int, float]] = []  # first step, length, value
+        self._made = made
+        self._horizon = _horizon(rules)  # [ns] after its end that an episode is held
+        self._held = Held()
+        self._booking = Booking(rules.score, self._held)
+        self._ahead: list[Verdict] = []  # whose time has not come yet
+        self._named: dict[str | None, list[Verdict]] = {}  # until their episode closes
+        self._names: Counter[str | None] = Counter()  # of the episodes that are held
+        self._nameless: ScoredEpisode | None = None  # the one that the next message would name
+        self._next_name: str | None = None
+        self._forgotten = False  # whether no step is left of the last episode
 
-    def begin_episode(self) -> None:
-        """Begin an episode; the scores of the one before must have been given."""
-        self._begun = self._scored = 0
+    # ------------------------------------------------------------------------------------------
+    # episodes
 
-    def step_begun(self) -> None:
-        """Count a step of the episode that begins."""
-        self._begun += 1
+    def begin_episode(
+        self, number: int, now: int, continues: bool = False
+    ) -> Iterator[CompositeReward]:
+        """Begin an episode; yields the scores of those of which no more can come.
+
+        Args:
+            number: of the episode.
+            now: the time of its first step [ns].
+            continues: whether it goes on with the last one, after steps that were lost.
+        """
+        held, before = self._held, self._held.ended
+        unanswered = before is not None and before.answered < before.steps
+        if before is not None and continues:
+            before.whole = False
+        held.either |= unanswered and not continues
+        kept = 1 if self._rule.of == 'last_episode' else 0
+        while len(held.episodes) > kept and now > held.episodes[0].end_or(now) + self._horizon:
+            yield from self._close(held.episodes.pop(0))
+        held.running = ScoredEpisode(
+            number,
+            now,
+            whole=not continues,
+            lacks_begin=continues and (unanswered or self._forgotten),
+            name=self._next_name,
+        )
+        held.episodes.append(held.running)
+        self._next_name = self._nameless = None
+        self._forgotten = False
+
+    def step_begun(self, now: int) -> None:
+        """Count a step of the running episode, which begins now [ns]."""
+        assert self._held.running is not None
+        self._held.running.begin_step(now, self._rule.timed)
+        self._book_waiting()
 
     def step_dropped(self) -> None:
         """Drop the step that began last."""
-        self._begun -= 1
+        assert self._held.running is not None
+        self._held.running.drop_step()
 
-    def take(self, message: Message) -> None:
-        """Take the score that a message carries.
-
-        Raises:
-            FitError: its field holds no number.
-        """
-        rule = self._rules.score
-        value = mapping.field(message.message, rule.field, rule.topic)
-        try:
-            number = float(value)
-        except (TypeError, ValueError):
-            raise FitError(f'{rule.topic}: field {rule.field!r} holds no number') from None
-        length = self._begun - self._scored if rule.steps is None else rule.steps
-        first = self._begun - length
-        if not np.isfinite(number):
-            self._conversion.dropped[SCORE_NOT_FINITE] += 1
-        elif length < 1 or first < 0:
-            self._conversion.dropped[SCORE_OF_NOTHING] += 1
-        elif first < self._scored:
-            self._conversion.dropped[SCORE_AGAIN] += 1
-        else:
-            self._held.append((first, length, number))
-            self._scored = self._begun
-
-    def give(self, episode: int, written: int) -> Iterator[CompositeReward]:
-        """Yield the scores of an episode that has ended.
+    def end_episode(self, now: int | None) -> None:
+        """End the running episode; one without steps is forgotten.
 
         Args:
-            episode: its number.
-            written: the number of its steps.
+            now: when it ends [ns]; when its last step began, if None.
         """
-        scores, self._held = self._held, []
-        for first, length, value in scores:
-            there = min(length, written - first)
-            if there < length:
-                trimmed = self._rules.score.of == 'since_last' and there > 0
-                self._conversion.dropped[SCORE_TRIMMED if trimmed else SCORE_DROPPED] += 1
-                if not trimmed:
-                    continue
+        ended = self._held.running
+        if ended is None:
+            return
+        self._held.running = None
+        ended.end = ended.last if now is None else now
+        if ended.steps:
+            self._held.ended = self._nameless = ended
+            self._names[ended.name] += 1
+        else:
+            self._forgotten = True
+            self._held.episodes.remove(ended)
+            self._drop(conversion.SCORE_DROPPED, len(ended.segments))
+        self._book_waiting()
+
+    def name_episode(self, message: Message) -> None:
+        """Name the episode that ended last, or the next one, by a message that ends episodes.
+
+        Raises:
+            FitError: its field holds no name.
+        """
+        rule = self._rules.episode
+        if rule.id is None:
+            return
+        name = name_in(message.message, rule.id, message.topic)
+        if rule.id_is_of == 'next':
+            self._next_name = name
+        elif self._nameless is not None:
+            self._names[self._nameless.name] -= 1
+            self._nameless.name = name
+            self._names[name] += 1
+        self._nameless = None
+
+    # ------------------------------------------------------------------------------------------
+    # scores
+
+    def take(self, message: Message, now: int) -> None:
+        """Take the score that a message carries, received now [ns].
+
+        Raises:
+            FitError: a field that the mapping names is not there, or holds something else.
+        """
+        rule, topic, content = self._rule, message.topic, message.message
+        value = number(content, rule.field, topic)
+        if not np.isfinite(value):
+            self._drop(conversion.SCORE_NOT_FINITE)
+            return
+        at = now if rule.stamp is None else moment(content, rule.stamp, topic)
+        begin = at - round((rule.seconds or 0.0) * NS)
+        if rule.begin is not None:
+            begin = moment(content, rule.begin, topic)
+        name = None if rule.id is None else name_in(content, rule.id, topic)
+        verdict = Verdict(value, at, now, begin, name)
+        if name is not None:
+            self._named.setdefault(name, []).append(verdict)
+        elif at > now:
+            self._ahead.append(verdict)
+        else:
+            self._book(verdict)
+
+    def advance(self, now: int) -> None:
+        """Book the scores whose time has come before now [ns]."""
+        if self._ahead:
+            due = sorted((v for v in self._ahead if v.at < now), key=lambda v: v.at)
+            self._ahead = [v for v in self._ahead if v.at >= now]
+            for verdict in due:
+                self._book(verdict)
+
+    def finish(self) -> Iterator[CompositeReward]:
+        """Yield the scores that are still held: no more can come."""
+        self._drop(conversion.SCORE_AHEAD, len(self._ahead))
+        for episode in self._held.episodes:
+            yield from self._close(episode)
+        self._drop(conversion.SCORE_WITHOUT_EPISODE, sum(map(len, self._named.values())))
+
+    def _book(self, verdict: Verdict) -> None:
+        fault = self._booking.book(verdict)
+        if fault is not None:
+            self._drop(fault)
+
+    def _book_waiting(self) -> None:
+        for verdict in self._booking.waiting():
+            self._book(verdict)
+
+    def _drop(self, what: str, times: int = 1) -> None:
+        if times:
+            self._made.dropped[what] += times
+
+    # ------------------------------------------------------------------------------------------
+    # giving them out
+
+    def _close(self, episode: ScoredEpisode) -> Iterator[CompositeReward]:
+        """Yield the scores of an ended episode that is not held any more."""
+        assert episode.end is not None
+        self._held.closed = episode.end
+        self._take_named(episode)
+        self._names[episode.name] -= 1
+        for segment in episode.sound(self._rule.of != 'last_steps', self._made.dropped):
             yield CompositeReward(
                 run_id=self._run_id,
                 source=self._rules.source,
                 scorer=self._rules.source,
-                sequence=self._conversion.scores,
-                episode=episode,
-                first_step=first,
-                length=there,
-                value=value,
+                sequence=self._made.scores,
+                episode=episode.number,
+                first_step=segment.first,
+                length=segment.length,
+                value=segment.value,
             )
-            self._conversion.scores += 1
-            self._conversion.scored_steps += there
+            made = self._made
+            made.fewest = min(made.fewest, segment.length) if made.scores else segment.length
+            made.most = max(made.most, segment.length)
+            made.scores += 1
+            made.scored_steps += segment.length
+
+    def _take_named(self, episode: ScoredEpisode) -> None:
+        """Book the scores that name an episode."""
+        verdicts = self._named.pop(episode.name, []) if episode.name is not None else []
+        for verdict in verdicts:
+            fault: str | None = conversion.SCORE_OF_NAMESAKES
+            if self._names[episode.name] == 1:
+                fault = self._booking.book_whole(episode, verdict)
+            if fault is not None:
+                self._drop(fault)
+
+
+def _horizon(rules: Mapping) -> float:
+    """How long after its end [ns] an episode is held, because a score of it may come."""
+    rule = rules.score
+    late = 0.0 if rule.by_arrival and rule.late is None else rule.late
+    if rule.stamp is None:
+        if rule.of == 'last_episode':
+            late = 0.0  # the one that ended last is held anyway
+        elif rule.seconds is not None:
+            late = 0.0  # a window ends when its score comes
+    if late is None:
+        return float('inf')
+    return (late + (rule.seconds or 0.0) + rule.again_within) * NS

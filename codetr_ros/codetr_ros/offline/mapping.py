@@ -1,28 +1,25 @@
 """The mapping file of `codetr convert`: defines the topics of observation, action and score."""
 
-import re
 from collections.abc import Mapping as AnyMapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
-from codetr_ros.bags.names import full_name
 from codetr_ros.config import Group, SettingsError, validate
 from codetr_ros.offline.errors import FitError
+from codetr_ros.offline.message_fields import FieldPath, Topic, field
+from codetr_ros.offline.score_rules import Score
 from codetr_ros.records import F64
-
-Topic = Annotated[str, Field(pattern=r'^/?[^\s/]\S*$'), AfterValidator(full_name)]
-Path_ = Annotated[str, Field(pattern=r'^[A-Za-z_]\w*(\[\d+\])?(\.[A-Za-z_]\w*(\[\d+\])?)*$')]
 
 
 class Values(Group):
     """Numbers in the messages of a topic."""
 
     topic: Topic = Field(description='full name')
-    fields: tuple[Path_, ...] = Field(
+    fields: tuple[FieldPath, ...] = Field(
         min_length=1,
         description='fields in this order, such as position, data[0] or pose.position.x; an array '
         'gives all of its elements',
@@ -54,32 +51,11 @@ class Action(Values):
         return self
 
 
-class Score(Group):
-    """The score topic."""
-
-    topic: Topic = Field(description='full name')
-    field: Path_ = Field('data', description='the number that is the score')
-    of: Literal['since_last', 'last_steps'] = Field(
-        'since_last',
-        description='since_last: of all steps since the last score or the begin of the episode; '
-        'last_steps: of the last `steps` steps',
-    )
-    steps: int | None = Field(
-        None, ge=1, le=100_000, description='number of steps, for last_steps'
-    )
-
-    @model_validator(mode='after')
-    def _steps_where_needed(self) -> 'Score':
-        if (self.of == 'last_steps') != (self.steps is not None):
-            raise ValueError('steps must be given if `of` is last_steps, and only then')
-        return self
-
-
 class Episodes(Group):
     """The ends of episodes."""
 
     topic: Topic | None = Field(None, description='a message on it ends the episode')
-    field: Path_ | None = Field(None, description='only where this field ...')
+    field: FieldPath | None = Field(None, description='only where this field ...')
     equals: bool | int | float | str | None = Field(None, description='... has this value')
     terminal: bool = Field(
         False,
@@ -88,6 +64,13 @@ class Episodes(Group):
     gap: float = Field(
         1.0, gt=0, le=86_400, description='seconds without a command, which end the episode too'
     )
+    id: FieldPath | None = Field(
+        None, description='field that names the episode, for scores that name it'
+    )
+    id_is_of: Literal['ended', 'next'] = Field(
+        'ended',
+        description='whether the message names the episode that it ends, or the one that begins',
+    )
 
     @model_validator(mode='after')
     def _field_and_value(self) -> 'Episodes':
@@ -95,6 +78,8 @@ class Episodes(Group):
             raise ValueError('field and equals belong together: both are needed, or neither')
         if self.field is not None and self.topic is None:
             raise ValueError('field without a topic')
+        if self.id is not None and self.topic is None:
+            raise ValueError('id without a topic')
         return self
 
 
@@ -128,6 +113,21 @@ class Mapping(Group):
     episode: Episodes = Field(default_factory=Episodes)
     sampling: Sampling = Field(default_factory=Sampling)
 
+    @model_validator(mode='after')
+    def _scores_find_episodes(self) -> 'Mapping':
+        if self.score.id is not None and self.episode.id is None:
+            raise ValueError(
+                'score.id names an episode, but episodes have no names: give episode.id, the '
+                'field of the episode topic with the same name or number'
+            )
+        by_rate = self.sampling.by == 'rate' and self.episode.topic is None
+        if self.score.of == 'last_episode' and by_rate:
+            raise ValueError(
+                'score.of is last_episode, and sampling.by is rate: an episode then goes on for '
+                'episode.gap seconds after its last command. Give episode.topic'
+            )
+        return self
+
     @property
     def topics(self) -> set[str]:
         """All topics of the mapping."""
@@ -151,34 +151,6 @@ def load(path: Path) -> Mapping:
     if not isinstance(data, AnyMapping):
         raise SettingsError(f'mapping {path} must hold a mapping, not {type(data).__name__}')
     return validate(Mapping, data, f'mapping {path}')
-
-
-_PART = re.compile(r'(\w+)(?:\[(\d+)\])?$')
-
-
-def field(message: Any, path: str, topic: str) -> Any:
-    """The value of a field of a message.
-
-    Raises:
-        FitError: the message has no such field or element.
-    """
-    value = message
-    for part in path.split('.'):
-        matched = _PART.match(part)
-        assert matched is not None  # by the pattern of the mapping
-        name, index = matched[1], matched[2]
-        if not hasattr(value, name):
-            there = [n for n in getattr(value, '__dict__', ()) if not n.startswith('_')]
-            raise FitError(
-                f'{topic} has no field {path!r}: there is no {name!r} in '
-                + (', '.join(there) or type(value).__name__)
-            )
-        value = getattr(value, name)
-        if index is not None:
-            if not hasattr(value, '__len__') or int(index) >= len(value):
-                raise FitError(f'{topic} has no element {path!r} in a message')
-            value = value[int(index)]
-    return value
 
 
 def joint_names(message: Any, topic: str) -> list[str]:
