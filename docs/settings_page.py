@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from codetr_ros.config import Settings, load
+from codetr_ros.runs.numbers import exact
 
 PAGE = Path(__file__).with_name('settings.md')
 HEAD = """\
@@ -92,7 +93,7 @@ def shown(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):
-        return f'{value:g}'
+        return exact(value)
     return ' '.join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 

@@ -66,7 +66,7 @@ def test_a_bag_becomes_a_checkpoint_a_summary_and_a_report_without_ros(a_run, tm
         'training curve',
         'predicted and true composite rewards',
         'inferred and true step rewards',
-        'segments step by step',
+        *['a segment'] * 6,
     ]
     assert f'{said["metrics"]["composite_r2"]:.3f} on held-out episodes' in page
 
@@ -114,6 +114,9 @@ def test_only_steps_and_scores_are_needed(a_run, tmp_path, capsys):
     assert said['metrics']['pearson'] is None
     page = (tmp_path / 'out' / 'report.html').read_text()
     assert 'no bag holds the settings of a run' in page
+    assert re.search('<h1>(.*?)</h1>', page)[1] == (
+        'codetr fitted to the bag bag, 7 steps per score, schedule epochs'
+    )
     assert 'hold no true step rewards' in page
 
 

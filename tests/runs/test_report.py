@@ -199,7 +199,7 @@ def test_the_scale_of_inferred_rewards_stands_beside_that_of_the_true_ones() -> 
 
     assert 'an inferred reward is 1.9 +- < 0.0001' in scale_text(made)
     assert 'a true one 2 +- 0.5' in scale_text(made)
-    assert 'divided by 7.25' in scale_text(made)
+    assert 'in units of 7.25' in scale_text(made)
     assert not scale_text(made.model_copy(update={'reward_recovery': [row]}))
 
 

@@ -21,6 +21,7 @@ from codetr_ros.runs.document import (
     Table,
     Verbatim,
 )
+from codetr_ros.runs.numbers import exact
 
 
 def _every(results: Sequence[Result], name: str) -> str:
@@ -123,7 +124,7 @@ def the_paper(r_max: Mapping[str, float]) -> list[Block]:
         for composite, by in paper.TABLE_2.items()
     ]
     others = [task for task in r_max if task not in paper.TASKS]
-    units = ', '.join(f'{task} {value:g}' for task, value in r_max.items())
+    units = ', '.join(f'{task} {exact(value)}' for task, value in r_max.items())
     return [
         Heading("The paper's Table 2, and how ours differs"),
         Paragraph('Ant-v2, delays from 25 to 200, 3 trials, a million steps.'),

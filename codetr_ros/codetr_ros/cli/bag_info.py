@@ -13,6 +13,7 @@ from rich.table import Table
 
 from codetr_ros.cli import refuse
 from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs.numbers import exact
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,7 +116,8 @@ def _span(values: Mapping[str, float]) -> str:
     wrong = f'{count} not finite' if count else ''
     if not values['count']:
         return wrong or 'none'
-    text = f'{values["min"]:.6g} to {values["max"]:.6g}, mean {values["mean"]:.6g}'
+    low, high, mean = (exact(values[name]) for name in ('min', 'max', 'mean'))
+    text = f'{low} to {high}, mean {mean}'
     return f'{text}; {wrong}' if wrong else text
 
 

@@ -15,6 +15,7 @@ from codetr_ros.config import Settings, SettingsError
 from codetr_ros.records import EpisodeResult, Policy
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.folder import RunFolderError
+from codetr_ros.runs.numbers import number
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,5 +151,5 @@ def table(results: Sequence[EpisodeResult]) -> Table:
     for name, values in rows:
         array = np.array(values)
         spread = (array.mean(), array.std(), array.min(), array.max())
-        shown.add_row(name, *(f'{value:.6g}' for value in spread))
+        shown.add_row(name, *(number(float(value), 6) for value in spread))
     return shown

@@ -19,6 +19,7 @@ from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.settings import OF_NO_EFFECT, FitSettings
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.folder import RunFolderError
+from codetr_ros.runs.numbers import exact
 
 if TYPE_CHECKING:
     from codetr_ros.offline.episodes import Index
@@ -186,10 +187,10 @@ def _epochs(arguments: Sequence[str], given: Arguments) -> int:
 
 
 def _line(check: 'Check', fit: FitSettings) -> str:
-    loss = '' if check.loss is None else f'loss {check.loss:.4g}, '
+    loss = '' if check.loss is None else f'loss {exact(check.loss, 4)}, '
     return (
         f'step {check.gradient_steps} of at most {fit.gradient_steps}: {loss}'
-        f'held-out loss {check.held_out_loss:.4g}'
+        f'held-out loss {exact(check.held_out_loss, 4)}'
     )
 
 

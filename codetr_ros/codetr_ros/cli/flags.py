@@ -15,6 +15,7 @@ from pydantic.fields import FieldInfo
 
 from codetr_ros import config
 from codetr_ros.config import Settings, SettingsError
+from codetr_ros.runs.numbers import exact
 
 _BOUNDS = {'ge': '>=', 'gt': '>', 'le': '<=', 'lt': '<'}
 
@@ -40,7 +41,9 @@ COMMON = (
 
 def _help(field: FieldInfo) -> str:
     bounds = [
-        f'{sign} {bound:g}' if isinstance(bound := getattr(m, name), float) else f'{sign} {bound}'
+        f'{sign} {exact(bound)}'
+        if isinstance(bound := getattr(m, name), float)
+        else f'{sign} {bound}'
         for name, sign in _BOUNDS.items()
         for m in field.metadata
         if hasattr(m, name)

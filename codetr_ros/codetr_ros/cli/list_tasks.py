@@ -7,6 +7,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from codetr_ros.runs.numbers import exact
 from codetr_ros.simulation import tasks
 
 
@@ -31,7 +32,7 @@ def main(arguments: Sequence[str]) -> int:
         library = {'gymnasium': 'Gymnasium', 'dm_control': 'DM Control'}.get(
             task.library, task.library
         )
-        table.add_row(task.name, library, str(task.horizon), f'{task.r_max:g}', task.note)
+        table.add_row(task.name, library, str(task.horizon), exact(task.r_max), task.note)
     console = Console()
     console.print(table)
     console.print(

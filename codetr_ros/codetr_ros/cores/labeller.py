@@ -112,6 +112,7 @@ class Labeller(Consumer):
         metrics |= {
             'steps_labelled': sum(len(part.labels) for part in parts),
             'target_scale': method.target_scale,
+            'label_unit': method.unit,
             'gradient_steps': method.gradient_steps,
             'label_seconds': time.perf_counter() - began,
         }

@@ -20,6 +20,9 @@ from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.sources import settings_of
 from codetr_ros.records import CompositeReward, RunSpec, TaskSpec, Transitions
 
+UNKNOWN_TASK = 'unknown'
+"""The task in the settings of a fit whose bags name none."""
+
 AGAIN = 'steps sent again'
 COPIES = 'steps of episodes that another bag holds too'
 UNSOUND = 'steps with values that are not finite'
@@ -260,7 +263,7 @@ class Index:
                 f'a run in the bags has {known}' if known else 'no bag holds the settings of a run'
             )
             self.notes.append(f'delay = {delay}, the longest scored segment: {why}')
-        tasks = [*self.tasks, *(settings.task for settings in self.settings), 'unknown']
+        tasks = [*self.tasks, *(settings.task for settings in self.settings), UNKNOWN_TASK]
         return {'delay': delay, 'task': tasks[0]}
 
 

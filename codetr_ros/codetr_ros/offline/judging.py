@@ -10,28 +10,13 @@ from codetr_ros.offline.loading import Loaded
 from codetr_ros.records import F32, F64, I64
 from codetr_ros.rewards.base import Predictor, RewardMethod
 from codetr_ros.runs.recovery_metrics import r_squared, step_recovery
+from codetr_ros.runs.segments import Segment, spread_evenly
 
 MEASURES = (
     *('segments', 'composite_r2', 'segments_with_true_rewards'),
     *('pearson', 'spearman', 'within_pearson', 'within_spearman'),
 )
 """The names of the metrics of a judgement."""
-SHOWN = 6
-"""Number of segments of which a report shows every step."""
-
-
-@dataclass(kw_only=True)
-class Shown:
-    """Every step of one segment, for a picture."""
-
-    source: str
-    episode: int
-    first: int
-    value: float  # its composite reward
-    predicted: float | None
-    labels: F32
-    true: F32 | None
-    weights: F32 | None  # attention weights w, 1 on average
 
 
 @dataclass(kw_only=True)
@@ -43,7 +28,7 @@ class Judgement:
     predicted: F64 | None  # (S,) as predicted by the model; None for rules
     labels: F32  # steps whose true rewards are known, one after the other
     true: F32
-    shown: list[Shown]
+    shown: list[Segment]
 
 
 def judge(method: RewardMethod, loaded: Loaded) -> Judgement:
@@ -113,19 +98,17 @@ def _shown(
     true: F32,
     known: np.ndarray[Any, Any],
     predicted: F64 | None,
-) -> list[Shown]:
+) -> list[Segment]:
     """Segments for pictures, spread evenly from the lowest to the highest score."""
     memory = loaded.memory
-    order = np.argsort(memory.segments.scores(ids), kind='stable')
-    chosen = order[np.linspace(0, len(ids) - 1, min(SHOWN, len(ids))).round().astype(int)]
     _, episodes, firsts, lengths = memory.segments.spans(ids)[0]
     shown = []
-    for i in chosen.tolist():
+    for i in spread_evenly(memory.segments.scores(ids)):
         stretch, length = loaded.stretches[int(episodes[i])], int(lengths[i])
         batch = memory.segments.batch(ids[i : i + 1], method.context)
         weights = method.step_weights(batch)
         shown.append(
-            Shown(
+            Segment(
                 source=stretch.key.source,
                 episode=stretch.episode,
                 first=stretch.first + int(firsts[i]),

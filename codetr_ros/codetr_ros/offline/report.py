@@ -1,33 +1,40 @@
 """The report of a fit: one HTML page with its pictures."""
 
-import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from codetr_ros.config import flatten
-from codetr_ros.offline.judging import Judgement, Shown
+from codetr_ros.offline.episodes import UNKNOWN_TASK
+from codetr_ros.offline.judging import Judgement
 from codetr_ros.offline.results import rows
 from codetr_ros.offline.settings import OF_NO_EFFECT
-from codetr_ros.runs import document
+from codetr_ros.runs import document, pictures
 from codetr_ros.runs import folder as run_folder
-from codetr_ros.runs.document import Block, Heading, Paragraph, Picture, facts
+from codetr_ros.runs.document import Block, Folded, Gallery, Heading, Paragraph, Picture, facts
+from codetr_ros.runs.pictures import Figure
+from codetr_ros.runs.report_origin import own_settings, setting
 from codetr_ros.system.files import atomic_write
 
-_TRUE, _INFERRED, _GREY = '#1f5fa8', '#b8561c', '#555'
-_MOST_POINTS = 5000
-"""The most points of a scatter plot; of more, every n-th is shown, as the caption states."""
-
-Axes = Any  # matplotlib has no types
+_SQUARE = (4.4, 3.9)
 
 
 def title(summary: Mapping[str, Any]) -> str:
     """The fit in a line."""
     return (
-        f'{summary["method"]} fitted to {summary["task"]}, {summary["delay"]} steps per score, '
+        f'{summary["method"]} fitted to {_data(summary)}, {summary["delay"]} steps per score, '
         f'schedule {summary["schedule"]}'
+    )
+
+
+def _data(summary: Mapping[str, Any]) -> str:
+    """The task; where no bag names one, the bags."""
+    if summary['task'] != UNKNOWN_TASK:
+        return str(summary['task'])
+    names = [Path(bag).name for bag in summary['bags']]
+    more = f' and {len(names) - 2} more' if len(names) > 3 else ''
+    return (
+        f'the {"bag" if len(names) == 1 else "bags"} {", ".join(names[: 2 if more else 3])}{more}'
     )
 
 
@@ -47,7 +54,7 @@ def page(summary: Mapping[str, Any], judged: Judgement | None) -> str:
     settings = [
         *((f'fit: {name}', value) for name, value in summary['fit'].items()),
         *(
-            (name, value)
+            (name, setting(value))
             for name, value in flatten(summary['settings'])
             if name.partition('.')[0] not in OF_NO_EFFECT
         ),
@@ -59,7 +66,8 @@ def page(summary: Mapping[str, Any], judged: Judgement | None) -> str:
         Heading('Data'),
         facts(summary['data']),
         Heading('Settings'),
-        facts(settings),
+        *own_settings(summary['settings'], OF_NO_EFFECT),
+        Folded(f'All {len(settings)} settings', [facts(settings)]),
     ]
     return document.page(blocks)
 
@@ -88,56 +96,39 @@ def _judged(summary: Mapping[str, Any], judged: Judgement) -> list[Block]:
         Paragraph(
             f'From the lowest to the highest score, evenly chosen.{bars if weights else ""}'
         ),
-        Picture(draw_segments(judged.shown), 'segments step by step'),
+        Gallery([Picture(pictures.segment(one), 'a segment') for one in judged.shown]),
     ]
-
-
-def _png(size: tuple[float, float], draw: Callable[[Any], None]) -> bytes:
-    # Without pyplot there is no display, and no state that outlives the picture.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, dpi=120, layout='constrained')
-    FigureCanvasAgg(figure)
-    draw(figure)
-    picture = io.BytesIO()
-    figure.savefig(picture, format='png')
-    return picture.getvalue()
 
 
 def draw_curve(summary: Mapping[str, Any]) -> bytes:
     """Losses against gradient steps, as a PNG."""
     curve = summary['curve']
 
-    def draw(figure: Any) -> None:
+    def draw(figure: Figure) -> None:
         axes = figure.subplots()
         axes.set_xlabel('gradient steps')
         axes.set_ylabel('mean squared error\n(in units of c², the scale of scores)')
         axes.set_yscale('log')
-        axes.grid(alpha=0.3)
         for name, label, colour in (
-            ('loss', 'training', _TRUE),
-            ('held_out_loss', 'held out', _INFERRED),
+            ('loss', 'training', pictures.TRUE),
+            ('held_out_loss', 'held out', pictures.INFERRED),
         ):
             known = [row for row in curve if row.get(name) is not None]
-            if known:
-                steps = [row['gradient_steps'] for row in known]
-                axes.plot(
-                    steps,
-                    [row[name] for row in known],
-                    'o-',
-                    markersize=3,
-                    color=colour,
-                    label=label,
-                )
+            points = [(row['gradient_steps'], row[name]) for row in known]
+            pictures.line(axes, points, label, colour)
         best = summary.get('best')
         if best:
             axes.axvline(
-                best['gradient_steps'], color=_GREY, ls='--', lw=1, label='best: the weights kept'
+                best['gradient_steps'],
+                color=pictures.GREY,
+                ls='--',
+                lw=1,
+                label='best: the weights kept',
             )
+        pictures.plain(axes)
         axes.legend(fontsize=8, framealpha=0.8)
 
-    return _png((8, 3.5), draw)
+    return pictures.png((pictures.WIDE, 3.2), draw)
 
 
 def draw_composites(judged: Judgement) -> bytes:
@@ -146,16 +137,16 @@ def draw_composites(judged: Judgement) -> bytes:
     predicted = judged.predicted
     r2 = judged.metrics['composite_r2']
 
-    def draw(figure: Any) -> None:
+    def draw(figure: Figure) -> None:
         axes = figure.subplots()
+        low, high = float(judged.values.min()), float(judged.values.max())
+        axes.plot([low, high], [low, high], color=pictures.GREY, ls='--', lw=1)
         caption = 'R² not defined' if r2 is None else f'R² {r2:.3f}'
-        _scatter(axes, judged.values, predicted, caption)
+        pictures.scatter(axes, judged.values, predicted, caption)
         axes.set_xlabel('true composite reward of a segment')
         axes.set_ylabel('predicted')
-        low, high = float(judged.values.min()), float(judged.values.max())
-        axes.plot([low, high], [low, high], color=_GREY, ls='--', lw=1)
 
-    return _png((5, 4.5), draw)
+    return pictures.png(_SQUARE, draw)
 
 
 def draw_steps(judged: Judgement) -> bytes:
@@ -166,62 +157,11 @@ def draw_steps(judged: Judgement) -> bytes:
         if judged.metrics[name] is not None
     ]
 
-    def draw(figure: Any) -> None:
+    def draw(figure: Figure) -> None:
         axes = figure.subplots()
-        _scatter(axes, judged.true, judged.labels, ', '.join(correlations) or 'no variance')
+        caption = ', '.join(correlations) or 'no variance'
+        pictures.scatter(axes, judged.true, judged.labels, caption)
         axes.set_xlabel('true step reward')
         axes.set_ylabel('inferred step reward')
 
-    return _png((5, 4.5), draw)
-
-
-def _scatter(axes: Axes, x: Any, y: Any, caption: str) -> None:
-    every = -(-len(x) // _MOST_POINTS)
-    shown = '' if every == 1 else f', one of {every} points shown'
-    axes.scatter(x[::every], y[::every], s=6, alpha=0.4, color=_TRUE, lw=0)
-    axes.set_title(f'{caption}{shown}', fontsize=10)
-    axes.grid(alpha=0.3)
-
-
-def draw_segments(segments: Sequence[Shown]) -> bytes:
-    """Labels, true rewards and attention weights over the steps of some segments, as a PNG."""
-    columns = min(2, len(segments))
-    lines = -(-len(segments) // columns)
-
-    def draw(figure: Any) -> None:
-        grid = figure.subplots(lines, columns, squeeze=False)
-        for axes, one in zip(grid.flat, segments, strict=False):
-            _segment(axes, one)
-        for axes in grid.flat[len(segments) :]:
-            axes.set_axis_off()
-        drawn = dict(
-            pair
-            for axes in figure.axes
-            for pair in zip(*reversed(axes.get_legend_handles_labels()), strict=True)
-        )
-        figure.legend(
-            drawn.values(), drawn.keys(), loc='outside upper center', ncols=3, fontsize=8
-        )
-
-    return _png((9, 2.3 * lines + 0.4), draw)
-
-
-def _segment(axes: Axes, one: Shown) -> None:
-    steps = one.first + np.arange(len(one.labels))
-    predicted = '' if one.predicted is None else f', predicted {one.predicted:.4g}'
-    axes.set_title(
-        f'{one.source}, episode {one.episode}: score {one.value:.4g}{predicted}', fontsize=8
-    )
-    axes.tick_params(labelsize=7)
-    axes.xaxis.get_major_locator().set_params(integer=True)
-    axes.set_xlabel('step of the episode', fontsize=7)
-    if one.weights is not None:
-        behind = axes.twinx()
-        behind.bar(steps, one.weights, width=0.9, color='#ccc', label='attention weight w (right)')
-        behind.set_ylim(0, 1.05 * max(1.0, float(one.weights.max())))
-        behind.tick_params(labelsize=7)
-        axes.set_zorder(behind.get_zorder() + 1)
-        axes.patch.set_visible(False)
-    axes.plot(steps, one.labels, 'o-', markersize=3, color=_INFERRED, label='inferred step reward')
-    if one.true is not None:
-        axes.plot(steps, one.true, 'o-', markersize=3, color=_TRUE, label='true step reward')
+    return pictures.png(_SQUARE, draw)

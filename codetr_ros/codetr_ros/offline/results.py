@@ -188,8 +188,9 @@ def rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ('Pearson within segments', 'within_pearson'),
         ('Spearman', 'spearman'),
     ):
-        value = 'not known' if metrics[key] is None else f'{metrics[key]:.3f}'
-        facts.append((name, f'{value} {summary["judged_on"]}'))
+        value = metrics[key]
+        shown = 'not known' if value is None else f'{value:.3f} {summary["judged_on"]}'
+        facts.append((name, shown))
     skipped = sum(summary['skipped'].values())
     what = f': {", ".join(f"{n} {name}" for name, n in summary["skipped"].items())}'
     return [

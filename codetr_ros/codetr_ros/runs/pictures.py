@@ -39,7 +39,7 @@ def png(size: tuple[float, float], draw: Callable[[Figure], None]) -> bytes:
 
 def plain(axes: Axes) -> None:
     """A light grid, no frame above and to the right, and numbers without exponents."""
-    from matplotlib.ticker import FuncFormatter, NullFormatter
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axes.grid(alpha=0.3)
     axes.spines[['top', 'right']].set_visible(False)
@@ -48,6 +48,9 @@ def plain(axes: Axes) -> None:
             axis.get_major_formatter().set_scientific(False)
             axis.get_major_formatter().set_useOffset(False)
         else:
+            low, high = axis.get_view_interval()
+            if high < 100 * low:
+                axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
             axis.set_major_formatter(FuncFormatter(lambda value, _: exact(value)))
             axis.set_minor_formatter(NullFormatter())
 

@@ -17,6 +17,7 @@ from rich.text import Text
 from codetr_ros.config import Settings
 from codetr_ros.records import Commit, EpisodeResult, Metrics, Presence, Record
 from codetr_ros.runs.display import Display
+from codetr_ros.runs.numbers import exact
 
 _RATE_WINDOW = 5  # phases over which the present speed is measured
 
@@ -134,9 +135,9 @@ class Progress(Display):
         if self._evaluation:
             facts.append(('evaluation', self._of(self._evaluation)))
         if 'reward_loss' in self._metrics:
-            facts.append(('reward loss', f'{self._metrics["reward_loss"]:.4g}'))
+            facts.append(('reward loss', exact(self._metrics['reward_loss'], 4)))
         if 'critic_loss' in self._metrics:
-            facts.append(('critic loss', f'{self._metrics["critic_loss"]:.4g}'))
+            facts.append(('critic loss', exact(self._metrics['critic_loss'], 4)))
         facts.append(('lost messages', str(self.lost)))
         spent = duration(self._clock() - self._began)
         facts.append(

@@ -1,6 +1,6 @@
 """The part of a run's report that tells where it comes from: machine, command, settings, files."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 from codetr_ros import config
@@ -44,19 +44,30 @@ def origin(summary: RunSummary, files: Sequence[tuple[str, str]]) -> Iterator[Bl
     ]
     yield Heading('How it was made')
     yield Facts(rows)
-    preset = config.nearest(summary.settings)
-    changed = config.differences(summary.settings, preset)
-    if not changed:
-        yield Paragraph(f'All settings are those of the preset {preset}.')
-    else:
-        yield Paragraph(f'Settings that differ from the preset {preset}, the nearest:')
-        yield Table(
-            ['setting', preset, 'here'],
-            [[name, setting(there), setting(here)] for name, there, here in changed],
-        )
+    yield from own_settings(summary.settings)
     if files:
         yield Paragraph("In the run's folder:")
         yield Links(files)
+
+
+def own_settings(settings: Mapping[str, Any], without: Collection[str] = ()) -> Iterator[Block]:
+    """The settings that differ from the nearest preset.
+
+    Args:
+        settings: nested mapping, as JSON has it.
+        without: settings, and groups of them, that have no effect.
+    """
+    preset = config.nearest(settings)
+    changed = [
+        [name, setting(there), setting(here)]
+        for name, there, here in config.differences(settings, preset)
+        if name.partition('.')[0] not in without
+    ]
+    if not changed:
+        yield Paragraph(f'All settings are those of the preset {preset}.')
+        return
+    yield Paragraph(f'Settings that differ from the preset {preset}, the nearest:')
+    yield Table(['setting', preset, 'here'], changed)
 
 
 def setting(value: Any) -> str:

@@ -116,10 +116,8 @@ def scale_text(summary: RunSummary) -> str:
     )
     if summary.label_unit is None or summary.label_unit == 1:
         return text
-    return (
-        f'{text} The policy learns from the inferred ones divided by '
-        f'{number(summary.label_unit)}, the root mean square score per step of the warm-up.'
-    )
+    unit = number(summary.label_unit)
+    return f'{text} The policy learns from the inferred ones in units of {unit}.'
 
 
 _BARS = ' ▁▂▃▄▅▆▇█'

@@ -163,16 +163,16 @@ class Summary:
 
     @property
     def label_unit(self) -> float | None:
-        """The unit of labels in that of the task; None if not known, as before any label."""
-        if self.settings.reward_unit == 'raw':
-            return 1.0
-        scales = [
+        """The unit of labels in that of the task, as the reward node reported it last; None if it
+        did not.
+        """
+        units = [
             value
             for _, values in sorted(self._metrics.items())
             for (role, _, name), value in values.items()
-            if (role, name) == ('reward', 'target_scale')
+            if (role, name) == ('reward', 'label_unit')
         ]
-        return scales[-1] if scales and scales[-1] > 0 else None
+        return units[-1] if units and units[-1] > 0 else None
 
     def segments(self) -> list[Segment]:
         """Some segments with their inferred and true rewards, in the unit of the task; none if the
