@@ -12,10 +12,18 @@ On-policy, with a gradient through the policy: it runs in process and in lock-st
 from each phase's steps once the phase is over, and forgets them. Nothing labels steps and there is
 no reward node; R is a segment's composite reward at its last step and 0 elsewhere.
 
-How certain this is: structure and constants were read from the authors' published code, and so was
-the handwritten Adam whose second moment is a constant to the meta-gradient. Points marked
-(recalled) were not looked up again. It is inferred that the comparison in the CoDeTr paper used
-that code, with its delay of rewards set to n. The differences, all on purpose:
+How certain this is: structure and constants were read from the authors' published code, its PPO
+for MuJoCo, and with them:
+
+- The handwritten Adam takes the second moment as a constant to the meta-gradient.
+- Both objectives normalise advantages by minibatch, and the meta-gradient goes through that of the
+  inner one.
+- The norm of gradients is bounded for each of the two updates by itself, policy with value and
+  intrinsic reward with value of R. The meta-gradient goes through the bound of the inner one.
+- Eta and theta move together after each minibatch.
+
+A point marked (recalled) was not looked up again. It is inferred that the comparison in the CoDeTr
+paper used that code, with its delay of rewards set to n. The differences, all on purpose:
 
 - A phase (`phase_steps`, 1000) takes the place of 2048 steps. `lirpg.batch` sets the size of a
   minibatch to theirs, 64; they set the number of minibatches, 32.
@@ -27,15 +35,10 @@ that code, with its delay of rewards set to n. The differences, all on purpose:
   `target_scale` and `reward_unit` do not matter. The running return begins anew with each phase.
 - Moments of the observations change between phases, not between steps, so that a phase has one
   policy. They begin with the warm-up's random steps, from which nothing else is learnt.
-- At the time limit values are bootstrapped, as everywhere here; theirs are not (recalled).
+- At the time limit values are bootstrapped, as everywhere here; theirs are not.
 - The value loss is a plain squared error (half of it, times `value_coefficient`); theirs is
-  clipped (recalled). There is no bonus for entropy (their coefficient is 0). Adam's step size and
-  the place of its epsilon are torch's.
-
-Decided here, where nothing was known: Both objectives normalise advantages by minibatch. The norm
-of gradients is bounded for each of the two updates by itself, policy with value and intrinsic
-reward with value of R. The meta-gradient goes through that bound and through the normalisation.
-Eta and theta move together after each minibatch.
+  clipped. There is no bonus for entropy (their coefficient is 0). Adam's step size and the place
+  of its epsilon are torch's.
 
 Shapes: T = steps of the phase, B = steps of a minibatch, O, A = sizes of observation and action.
 
