@@ -110,7 +110,7 @@ def idle(settings: Settings, seconds: float) -> Iterator[Row]:
 
 def a_phase(phase: int) -> list[Record]:
     """1000 steps of Ant and their scores, in the chunks of a simulator."""
-    from codetr_ros.simulation.source import chunk_steps
+    from codetr_ros.simulation.chunks import chunk_steps
 
     rng = np.random.default_rng(phase)
     most, records = chunk_steps(OBSERVATIONS, ACTIONS), list[Record]()

@@ -5,6 +5,7 @@ its generators from (seed, core, phase, slice), and no generator state is ever s
 """
 
 import hashlib
+import random
 
 import numpy as np
 import torch
@@ -24,3 +25,15 @@ def generator(seed: int, *names: str | int) -> np.random.Generator:
 def seed_torch(seed: int, *names: str | int) -> None:
     """Seed torch's global generators, from which dropout and `torch.randn` draw."""
     torch.manual_seed(entropy(seed, *names) & (2**63 - 1))
+
+
+def seed_global(seed: int, *names: str | int) -> None:
+    """Seed every global generator: those of Python, numpy and torch.
+
+    For code that is not ours, such as an environment, which may draw from any of them. Our own
+    draws come from `generator`, and from torch's after `seed_torch`.
+    """
+    number = entropy(seed, *names)
+    random.seed(number)
+    np.random.seed(np.frombuffer(number.to_bytes(16, 'big'), '>u4').astype(np.uint32))  # noqa: NPY002
+    seed_torch(seed, *names)

@@ -1,6 +1,8 @@
 """A task of one's own: bring a cart on a rail to its middle, scored every 20 steps.
 
 python examples/own_task/cart.py [any flag of `codetr train`]
+
+Over topics, from this folder: codetr train --task cart:Cart-v0 --delay 20
 """
 
 import sys

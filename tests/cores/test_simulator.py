@@ -19,7 +19,7 @@ from codetr_ros.records import (
 )
 from codetr_ros.seeding import generator
 from codetr_ros.simulation import tasks
-from codetr_ros.simulation.source import CHUNK_STEPS, chunk_steps
+from codetr_ros.simulation.chunks import CHUNK_STEPS, chunk_steps
 from helpers.builders import policy, same, task_spec, tiny
 from helpers.builders import run as run_spec
 from helpers.simulating import (

@@ -299,12 +299,12 @@ def test_a_reward_that_is_not_finite_is_refused_naming_task_step_and_field(count
         environment.step(np.zeros(1, np.float32))
 
 
-def test_an_environment_that_truncates_before_its_horizon_is_refused(counting):
+def test_an_environment_that_truncates_before_its_horizon_states_it(counting):
     environment = make(counting(at=2, truncated=True))
     environment.reset(seed=0)
-    environment.step(np.zeros(1, np.float32))
-    with pytest.raises(TaskError, match='at step 2 of horizon=10: .*max_episode_steps=2'):
-        environment.step(np.zeros(1, np.float32))
+    for truncated in (False, True):
+        _, _, terminated = environment.step(np.zeros(1, np.float32))
+        assert (terminated, environment.truncated) == (False, truncated)
 
 
 def test_finding_a_task_imports_no_simulation_and_making_an_old_version_warns_of_nothing(tmp_path):

@@ -14,7 +14,7 @@ from codetr_ros.benchmark.folder import read_json
 from codetr_ros.benchmark.results import Result
 from codetr_ros.policy.acting import uniform_actions
 from codetr_ros.records import F32, F64
-from codetr_ros.seeding import generator
+from codetr_ros.seeding import generator, seed_global
 from codetr_ros.simulation import tasks
 from codetr_ros.simulation.composite import composite, perfect_score
 from codetr_ros.simulation.environments import Environment
@@ -67,6 +67,7 @@ def anchors(results: Sequence[Result], path: Path) -> Anchors:
 
 def simulate(task: str, episodes: int) -> dict[str, list[F64]]:
     """True rewards of each episode of the random policy and of the zero action."""
+    seed_global(SEED, 'environment')
     environment = tasks.make(task)
     shape = environment.horizon, environment.action_size
     try:
@@ -85,12 +86,13 @@ def simulate(task: str, episodes: int) -> dict[str, list[F64]]:
 def _episodes(environment: Environment, episodes: int, actions: Callable[[int], F32]) -> list[F64]:
     earned = []
     for number in range(episodes):
+        seed_global(SEED, 'environment', 'evaluate', number)
         environment.reset(int(generator(SEED, 'evaluate', number).integers(2**31)))
         rewards = []
         for action in actions(number):
             _, reward, terminated = environment.step(action)
             rewards.append(reward)
-            if terminated:
+            if terminated or environment.truncated:
                 break
         earned.append(np.array(rewards, np.float64))
     return earned

@@ -68,6 +68,7 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
         arguments: those of `codetr train`.
         start: starts the nodes.
     """
+    from codetr_ros.cli import tryout
     from codetr_ros.simulation import tasks
 
     more = [
@@ -100,13 +101,28 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
                 f'--method {settings.method} {config.IN_PROCESS_ONLY[settings.method]}: '
                 'it runs in process only. Add --in-process, or choose another --method'
             )
+        if in_process:
+            # before torch is imported: the threads of the nodes, for the same results bit for bit
+            os.environ.update(launcher.threading_environment(settings))
         tasks.check(settings, tasks.find(settings.task))
         if not in_process:
             for role in settings.roles:
                 launcher.executable(role)
         stamp = time.strftime('%Y%m%d-%H%M%S')
-        folder = run_folder.create(Path(extra['out'] or default_out(settings, stamp)))
-    except (SettingsError, tasks.TaskError, RunFolderError, LaunchError) as error:
+        out = Path(extra['out'] or default_out(settings, stamp))
+        run_folder.check(out)
+        if in_process:
+            tryout.here(settings)
+        else:
+            tryout.apart(settings, launcher.environment(settings))
+        folder = run_folder.create(out)
+    except (
+        SettingsError,
+        tasks.TaskError,
+        tryout.TryoutError,
+        RunFolderError,
+        LaunchError,
+    ) as error:
         return refuse(str(error))
     # A letter first: as a ROS parameter and in a namespace it must not read as a number.
     run_id = f'r{stamp.replace("-", "_")}_{secrets.token_hex(2)}'
@@ -182,7 +198,6 @@ def _in_process(
     progress: Progress,
     interrupts: Interrupts,
 ) -> Outcome:
-    # Before torch is imported: the threads of the nodes, for the same results bit for bit.
     os.environ.update(launcher.threading_environment(settings))
     from codetr_ros.cores import in_process
 

@@ -78,7 +78,9 @@ class Settings(Schedule, Group):
     """Everything that the nodes of a run must agree on."""
 
     task: str = Field(
-        'Ant-v4', min_length=1, description='task: a name of `codetr tasks` or any Gymnasium id'
+        'Ant-v4',
+        min_length=1,
+        description='task: a name of `codetr tasks`, any Gymnasium id, or module:id',
     )
     composite: Composite = Field(
         'sum', description="how a segment's rewards make its composite reward"

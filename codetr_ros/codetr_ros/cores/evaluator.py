@@ -9,7 +9,7 @@ from codetr_ros.policy.acting import ActingPolicy, uniform_actions
 from codetr_ros.records import INITIAL_VERSION, EpisodeResult, Record, RunSpec
 from codetr_ros.records.roles import subscribed
 from codetr_ros.runs.reports import CoreReport
-from codetr_ros.seeding import generator
+from codetr_ros.seeding import generator, seed_global
 from codetr_ros.simulation.episode import EpisodeRunner
 from codetr_ros.simulation.permission import acting_policy, check_policy
 from codetr_ros.simulation.tasks import make
@@ -38,6 +38,7 @@ class Evaluator(Part):
         self._run = run
         self._settings = settings
         self._name = name
+        seed_global(settings.seed, 'environment')  # the same as the simulator's
         self._environment = make(settings.task)
         self._episode = EpisodeRunner(self._environment, settings)
         self._waiting: deque[tuple[str, int, ActingPolicy | None]] = (
@@ -86,6 +87,7 @@ class Evaluator(Part):
     ) -> EpisodeResult:
         """Run one episode, from the start state that its number gives."""
         seed, episode, environment = self._settings.seed, self._episode, self._environment
+        seed_global(seed, 'environment', 'evaluate', number)
         episode.reset(int(generator(seed, 'evaluate', number).integers(2**31)))
         if acting is None:
             rng = generator(seed, 'evaluate', 'random', number)

@@ -21,6 +21,7 @@ from codetr_ros.config import Settings
 from codetr_ros.processes import middleware
 from codetr_ros.records import roles
 from codetr_ros.runs import folder as run_folder
+from codetr_ros.system import modules
 
 STOP_DEADLINE = 20.0
 """Seconds from SIGINT to SIGKILL, in which a node ends its slice and writes a checkpoint."""
@@ -101,7 +102,17 @@ def environment(settings: Settings, environ: Mapping[str, str] = os.environ) -> 
         'PYTHONUNBUFFERED': '1',
         **environ,
         **threading_environment(settings),
+        **_module_environment(settings, environ),
     }
+
+
+def _module_environment(settings: Settings, environ: Mapping[str, str]) -> dict[str, str]:
+    """The variable with which the nodes find the module of a task `module:id`, as this process
+    did.
+    """
+    module = modules.of_task(settings.task)
+    path = '' if module is None else modules.search_path(module, environ.get('PYTHONPATH', ''))
+    return {'PYTHONPATH': path} if path else {}
 
 
 def threading_environment(settings: Settings) -> dict[str, str]:

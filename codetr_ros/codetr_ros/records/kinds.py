@@ -77,7 +77,7 @@ class TaskSpec:
     task: str
     observation_size: int
     action_size: int
-    horizon: int  # steps after which an episode is truncated
+    horizon: int  # steps after which an episode is truncated, if not before
     control_period: float  # seconds of simulated time that a step takes; 0 where unknown
     r_max: float  # the largest reward of one step, for score normalisation
 
@@ -117,7 +117,7 @@ class Transitions:
     actions: F32  # (T, A) in [-1, 1]
     # the last step ended the episode in a terminal state: nothing is bootstrapped from it
     terminated: bool
-    truncated: bool  # the last step ended the episode at its horizon
+    truncated: bool  # the last step ended the episode otherwise: at its horizon or before
     phase_end: bool  # these are the source's last steps of the phase
     scores_due: int  # on phase_end: composite rewards due for segments that ended in this phase
 

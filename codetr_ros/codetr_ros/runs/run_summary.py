@@ -95,6 +95,11 @@ class RunSummary(Facts):
         None, description='the command that started it; null if nodes were started one by one'
     )
     task: str = Field(description='task that was simulated')
+    task_module: str | None = Field(
+        None,
+        description='file of the module that registered the task, for a task `module:id`; null '
+        'otherwise, and in the first summaries',
+    )
     composite: str = Field(description="how a segment's rewards made its composite reward")
     delay: int = Field(description='length n of a segment [steps]')
     method: str = Field(description='how step rewards were made from composite rewards')

@@ -26,6 +26,7 @@ from codetr_ros.runs.reports import NodeReport
 from codetr_ros.runs.run_summary import Evaluation, RewardRecovery, RunSummary
 from codetr_ros.runs.segments import Segment
 from codetr_ros.runs.tallies import count_messages, processes
+from codetr_ros.system import modules
 from codetr_ros.system.files import atomic_write
 from codetr_ros.system.versions import versions
 
@@ -226,6 +227,7 @@ class Summary:
             host=platform.node(),
             command=self.command,
             task=settings.task,
+            task_module=modules.file_of_task(settings.task),
             composite=settings.composite,
             delay=settings.delay,
             method=settings.method,
@@ -259,7 +261,7 @@ class Summary:
             bag=_first(r.bag for r in of_role('record')) or (str(bag) if bag else None),
             processes=processes(reports),
             counters={n: r.counters for n, r in sorted(reports.items()) if r.counters},
-            versions=versions(),
+            versions=modules.version_of_task(settings.task) | versions(),
             settings_hash=settings.hash(),
             settings=settings_json,
         )

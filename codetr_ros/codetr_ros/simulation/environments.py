@@ -57,6 +57,10 @@ class Environment(ABC):
         observation_size: O.
         action_size: A.
         control_period: seconds of simulated time that a step takes; 0 where unknown.
+        truncated: whether the environment itself cut the episode off at the last step.
+
+    Raises:
+        TaskError: the action space has bounds that are not finite, or a space holds no number.
     """
 
     def __init__(
@@ -67,13 +71,9 @@ class Environment(ABC):
         high: NDArray[np.floating[Any]],
         control_period: float,
     ) -> None:
+        _check_sizes(task, observation_size, int(low.size))
         for field, bounds in (('low', low), ('high', high)):
-            if not np.isfinite(bounds).all():
-                raise TaskError(
-                    f'task {task.name!r}: its action space has {field}={bounds.tolist()}: bounds '
-                    'must be finite, for actions in [-1, 1] to be scaled to them. `codetr tasks` '
-                    'lists the tasks that work'
-                )
+            _check_bounds(task, field, bounds)
         self.task = task
         self.name = task.name
         self.horizon = task.horizon
@@ -81,8 +81,12 @@ class Environment(ABC):
         self.observation_size = observation_size
         self.action_size = int(low.size)
         self.control_period = control_period
-        self._middle = (high + low).reshape(-1) / 2
-        self._half = (high - low).reshape(-1) / 2
+        self.truncated = False
+        self._type = low.dtype
+        self._low, self._high = low.reshape(-1), high.reshape(-1)
+        # halved before they are added, so that no bound is too large
+        self._middle = self._high / 2 + self._low / 2
+        self._half = self._high / 2 - self._low / 2
         self._shifted = bool((self._middle != 0).any())
         self._scaled = self._shifted or bool((self._half != 1).any())
         self._steps = 0
@@ -92,40 +96,53 @@ class Environment(ABC):
 
         Raises:
             TaskError: the observation is not finite, or not of the size that the environment
-                announced.
+                announced, or the environment is at fault in another way.
         """
         self._steps = 0
+        self.truncated = False
         observation = self._reset(seed)
         self._check(observation)
-        if len(observation) != self.observation_size:
-            raise TaskError(
-                f'task {self.name!r}, reset: {len(observation)} observations, '
-                f'{self.observation_size} announced'
-            )
         return observation
 
     def step(self, action: F32) -> tuple[F32, float, bool]:
-        """Take an action (A,) in [-1, 1].
+        """Take an action (A,) in [-1, 1]. `truncated` states whether that cut the episode off.
 
         Returns:
             The observation (O,) after it, the reward, and whether a terminal state was reached.
 
         Raises:
-            TaskError: the observation or the reward is not finite.
+            TaskError: the observation or the reward is not finite, or the environment is at fault
+                in another way.
         """
         self._steps += 1
-        scaled: NDArray[Any] = action
-        if self._scaled:
-            scaled = self._half * action
-        if self._shifted:
-            scaled = self._middle + scaled
-        observation, reward, terminated = self._step(scaled)
+        observation, reward, terminated, self.truncated = self._step(self._within_bounds(action))
         if not math.isfinite(reward):
             raise TaskError(self._not_finite('reward', reward))
         self._check(observation)
         return observation, reward, terminated
 
+    def _within_bounds(self, action: F32) -> NDArray[Any]:
+        """The action (A,) as the environment expects it, in memory that it may change."""
+        if not self._scaled:
+            return np.array(action, self._type)
+        scaled: NDArray[Any] = self._half * action
+        if self._shifted:
+            scaled = self._middle + scaled
+            # rounding may have led beyond a bound
+            np.minimum(np.maximum(scaled, self._low, out=scaled), self._high, out=scaled)
+        return scaled.astype(self._type, copy=False)
+
+    def _call(self) -> str:
+        """The call that the environment answered last, for errors."""
+        return f'step {self._steps} of the episode' if self._steps else 'reset'
+
     def _check(self, observation: F32) -> None:
+        if len(observation) != self.observation_size:
+            raise TaskError(
+                f'task {self.name!r}, {self._call()}: {len(observation)} observations, '
+                f'{self.observation_size} announced: the environment must return as many as its '
+                'observation space has'
+            )
         # a fifth of the time of a check of each number, and not finite where one of them is not
         if math.isfinite(observation.dot(observation)):
             return
@@ -136,8 +153,9 @@ class Environment(ABC):
 
     def _not_finite(self, field: str, value: float) -> str:
         return (
-            f'task {self.name!r}, step {self._steps} of the episode: {field} is {value}, it must '
-            'be finite: the simulation has diverged, or the environment is at fault'
+            f'task {self.name!r}, {self._call()}: {field} is {value}, it must be finite, and '
+            'observations fit float32 (up to 3.4e38): the simulation has diverged, or the '
+            'environment is at fault'
         )
 
     @abstractmethod
@@ -145,125 +163,45 @@ class Environment(ABC):
         """The first observation, in memory of the caller's own."""
 
     @abstractmethod
-    def _step(self, action: NDArray[Any]) -> tuple[F32, float, bool]:
-        """The next observation, reward and termination after an action (A,) within the bounds."""
+    def _step(self, action: NDArray[Any]) -> tuple[F32, float, bool, bool]:
+        """The next observation, reward, termination and truncation after an action (A,) within the
+        bounds, which the environment may change.
+        """
 
     @abstractmethod
     def close(self) -> None:
         """Free what the environment holds."""
 
 
-class GymnasiumEnvironment(Environment):
-    """An environment of Gymnasium with Box spaces, without the wrappers of `gymnasium.make`."""
-
-    def __init__(self, task: Task) -> None:
-        import gymnasium
-
-        try:
-            with _quiet():
-                # no checker, time limit or order enforcer: they would cost more than some
-                # simulations do
-                self._env = gymnasium.make(task.environment_id, disable_env_checker=True).unwrapped
-        except (gymnasium.error.Error, ImportError) as error:
+def _check_sizes(task: Task, observation_size: int, action_size: int) -> None:
+    for field, size in (('observation', observation_size), ('action', action_size)):
+        if size < 1:
             raise TaskError(
-                f'task {task.name!r} cannot be made: {error}. '
-                'Install what it needs, or choose a task that `codetr tasks` lists'
-            ) from error
-        spaces: dict[str, Any] = {
-            'observation': self._env.observation_space,
-            'action': self._env.action_space,
-        }
-        for field, space in spaces.items():
-            floats = field == 'observation' or np.issubdtype(space.dtype, np.floating)
-            if not isinstance(space, gymnasium.spaces.Box) or not floats:
-                raise TaskError(
-                    f'task {task.name!r}: its {field} space is {space}: only Box spaces can be '
-                    'used, of real numbers for actions. `codetr tasks` lists the tasks that work'
-                )
-        box = spaces['action']
-        size = math.prod(spaces['observation'].shape)
-        super().__init__(task, size, box.low, box.high, _period(self._env))
-
-    def _reset(self, seed: int) -> F32:
-        return _own(self._env.reset(seed=seed)[0])
-
-    def _step(self, action: NDArray[Any]) -> tuple[F32, float, bool]:
-        shaped = action.reshape(self._env.action_space.shape)
-        observation, reward, terminated, truncated, _ = self._env.step(shaped)
-        if truncated and self._steps < self.horizon:
-            raise TaskError(
-                f'task {self.name!r} truncated an episode itself, at step {self._steps} of '
-                f'horizon={self.horizon}: register it with max_episode_steps={self._steps}'
+                f'task {task.name!r}: its {field} space has no numbers in it: it needs one at '
+                'least. `codetr tasks` lists the tasks that work'
             )
-        return _own(observation), float(reward), bool(terminated)
-
-    def close(self) -> None:
-        """Free what the environment holds."""
-        self._env.close()
 
 
-class ControlSuiteEnvironment(Environment):
-    """A task of the DM Control suite at action repeat 1, its observations in one array."""
-
-    def __init__(self, task: Task) -> None:
-        domain, name = task.environment_id.split('-')
-        try:
-            with _quiet():
-                from dm_control import suite
-            with _quiet():  # again: the import has put MuJoCo's warnings elsewhere
-                self._env = suite.load(
-                    domain,
-                    name,
-                    task_kwargs={'time_limit': math.inf, 'random': 0},
-                    environment_kwargs={'flat_observation': True},
-                )
-        except ImportError as error:
-            raise TaskError(
-                f'task {task.name!r} needs dm_control: {error}. Install dm_control'
-            ) from error
-        box = self._env.action_spec()
-        size = math.prod(self._env.observation_spec()['observations'].shape)
-        super().__init__(task, size, box.minimum, box.maximum, float(self._env.control_timestep()))
-
-    def _reset(self, seed: int) -> F32:
-        # everything that a task of the suite draws comes from this generator
-        self._env.task.random.seed(seed)
-        return _own(self._env.reset().observation['observations'])
-
-    def _step(self, action: NDArray[Any]) -> tuple[F32, float, bool]:
-        from dm_control.rl.control import PhysicsError
-
-        try:
-            step = self._env.step(action)
-        except PhysicsError as error:
-            raise TaskError(
-                f'task {self.name!r}, step {self._steps} of the episode: {error}'
-            ) from error
-        # these tasks have no terminal states
-        return _own(step.observation['observations']), float(step.reward), False
-
-    def close(self) -> None:
-        """Free what the environment holds."""
-        self._env.close()
+def _check_bounds(task: Task, field: str, bounds: NDArray[np.floating[Any]]) -> None:
+    """Refuse bounds of actions that are none: infinite, or the largest number of a type."""
+    largest = min(float(np.finfo(bounds.dtype).max), float(np.finfo(np.float32).max))
+    # not a number fails the comparison too
+    if not (np.abs(bounds) < largest).all():
+        raise TaskError(
+            f'task {task.name!r}: its action space has {field}={bounds.tolist()}: bounds must be '
+            f'finite, and below {largest:.3g}, which stands for none, for actions in [-1, 1] to '
+            'be scaled to them. Give the action space the bounds of the actuators, or choose a '
+            'task that `codetr tasks` lists'
+        )
 
 
-def _own(raw: NDArray[Any]) -> F32:
+def flat(raw: NDArray[Any]) -> F32:
     """A copy in one dimension: environments reuse their arrays."""
     return np.array(raw, np.float32).reshape(-1)
 
 
-def _period(env: Any) -> float:
-    """Seconds of simulated time that a step takes; 0 where unknown."""
-    for name in ('dt', 'tau'):
-        value = getattr(env, name, None)
-        if isinstance(value, (int, float)) and value > 0:
-            return float(value)
-    fps = env.metadata.get('render_fps')
-    return 1 / fps if fps else 0.0
-
-
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Suppress warnings about which a user can do nothing while an environment is made.
 
     v4 is used on purpose (see Ant-v4), no display is needed, and both libraries' models use

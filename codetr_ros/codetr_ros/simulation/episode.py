@@ -25,9 +25,9 @@ class Score:
 class EpisodeRunner:
     """Runs one episode after another in an environment, each cut into segments from its start.
 
-    An episode ends in a terminal state (`terminated`) or at the horizon (`truncated`). One that
-    reaches a terminal state exactly at the horizon is terminated only. Its last segment may be
-    shorter and is scored too.
+    An episode ends in a terminal state (`terminated`), or is cut off (`truncated`) at the horizon
+    or before, where the environment itself does so. One that reaches a terminal state at that very
+    step is terminated only. Its last segment may be shorter and is scored too.
 
     Args:
         environment: the environment; this object steps it and nothing else may.
@@ -81,15 +81,17 @@ class EpisodeRunner:
             short, if any.
 
         Raises:
-            TaskError: the environment returned a number that is not finite.
+            TaskError: the environment returned a number that is not finite, or is at fault.
             CompositeError: the segment's composite reward is not finite.
         """
         self.observation, reward, self.terminated = self._environment.step(action)
         self._rewards[self.length] = reward
         self.length += 1
-        if self.length < self._due and not self.terminated:
+        cut = self._environment.truncated
+        if self.length < self._due and not self.terminated and not cut:
             return reward, None
-        self.truncated = self.length == self._environment.horizon and not self.terminated
+        ends = cut or self.length == self._environment.horizon
+        self.truncated = ends and not self.terminated
         first, settings = self._first_step, self._settings
         segment = self._rewards[first : self.length]
         value = composite(settings.composite, segment, settings.beta, settings.delay)

@@ -9,7 +9,6 @@ from codetr_ros.config import Settings
 from codetr_ros.policy.acting import ActingPolicy, uniform_actions
 from codetr_ros.records import (
     F32,
-    MESSAGE_BYTES,
     PROTOCOL_VERSION,
     CompositeReward,
     Policy,
@@ -19,19 +18,10 @@ from codetr_ros.records import (
     Transitions,
     TrueRewards,
 )
-from codetr_ros.seeding import generator
+from codetr_ros.seeding import generator, seed_global
+from codetr_ros.simulation.chunks import steps_of_chunks
 from codetr_ros.simulation.episode import EpisodeRunner, Score
-from codetr_ros.simulation.tasks import TaskError, make, r_max
-
-CHUNK_STEPS = 250
-"""The most steps of a chunk: bounds the time of an environment's part of a slice of work."""
-
-
-def chunk_steps(observation_size: int, action_size: int) -> int:
-    """The most steps T of a chunk such that (T+1, O) and (T, A) float32 fit; 0 if no step fits."""
-    numbers = MESSAGE_BYTES // 4
-    fitting = (numbers - observation_size) // (observation_size + action_size)
-    return max(0, min(CHUNK_STEPS, fitting))
+from codetr_ros.simulation.tasks import make, r_max
 
 
 class Source:
@@ -51,19 +41,13 @@ class Source:
 
     def __init__(self, run: RunSpec, settings: Settings, name: str) -> None:
         self.name = name
+        seed_global(settings.seed, 'environment')  # one environment, whoever makes it
         self.environment = make(settings.task)
         self.counters: Counter[str] = Counter()
         self._run = run
         self._settings = settings
         self._episode = EpisodeRunner(self.environment, settings)
-        sizes = self.environment.observation_size, self.environment.action_size
-        self._chunk_steps = chunk_steps(*sizes)
-        if not self._chunk_steps:
-            raise TaskError(
-                f'task {settings.task!r}: one step with {sizes[0]} observations and {sizes[1]} '
-                f'actions takes more than the {MESSAGE_BYTES} bytes of a message: choose a task '
-                'with smaller observations'
-            )
+        self._chunk_steps = steps_of_chunks(self.environment)
         self._episodes = -1  # number of the present one
         self._sequence = 0  # of the next chunk
         self._scores = 0  # scores given so far: the sequence number of the next
@@ -102,6 +86,8 @@ class Source:
         )
         taken, scores_before = 0, self._scores
         while taken < steps:
+            # others draw from them between two chunks
+            seed_global(self._settings.seed, 'environment', self.name, policy.phase, taken)
             if self._episode.over:
                 self._episodes += 1
                 seeds = generator(self._settings.seed, 'reset', self.name, self._episodes)

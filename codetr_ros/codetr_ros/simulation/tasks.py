@@ -7,13 +7,10 @@ import difflib
 from typing import Any
 
 from codetr_ros.config import Settings, SettingsError
-from codetr_ros.simulation.environments import (
-    ControlSuiteEnvironment,
-    Environment,
-    GymnasiumEnvironment,
-    Task,
-    TaskError,
-)
+from codetr_ros.simulation.control_suite import ControlSuiteEnvironment
+from codetr_ros.simulation.environments import Environment, Task, TaskError
+from codetr_ros.simulation.gymnasium_environment import GymnasiumEnvironment
+from codetr_ros.system import modules
 
 __all__ = ['TASKS', 'Environment', 'Task', 'TaskError', 'check', 'find', 'make', 'r_max']
 
@@ -77,28 +74,36 @@ _TASKS = (
     _dm_control('finger-spin', 'sparse reward'),
 )
 TASKS: dict[str, Task] = {task.name: task for task in _TASKS}
-"""The tasks with a name of their own; any other Gymnasium id works too."""
+"""The tasks with a name of their own; any other Gymnasium id works too, also `module:id`."""
 
 
 def find(name: str) -> Task:
-    """The task of a name. Imports Gymnasium only for names that are not in `TASKS`.
+    """The task of a name. Imports Gymnasium only for names that are not in `TASKS`, and the module
+    of a name `module:id`, which registers the environment.
 
     Raises:
-        TaskError: no such task, or one without a horizon.
+        TaskError: no such task, one without a horizon, or a module that cannot be imported.
     """
     if name in TASKS:
         return TASKS[name]
     import gymnasium
 
+    module = modules.of_task(name)
+    environment_id = name if module is None else name.removeprefix(f'{module}:')
+    if module is not None:
+        _import(name, module)
     try:
-        spec = gymnasium.spec(name)
+        spec = gymnasium.spec(environment_id)
     except (gymnasium.error.Error, ImportError) as error:
+        where = '' if module is None else f' in what module {module!r} registers'
         raise TaskError(
-            f'there is no task {name!r}{_close_to(name, gymnasium.registry)}. `codetr tasks` '
-            'lists the tasks with a name; any Gymnasium id with Box spaces works as well. '
+            f'there is no task {name!r}{where}{_close_to(environment_id, gymnasium.registry)}. '
+            '`codetr tasks` lists the tasks with a name; any Gymnasium id with Box spaces works '
+            'as well, and `module:id` imports the module that registers it. '
             f'Error of Gymnasium: {error}'
         ) from None
-    if not spec.max_episode_steps:
+    steps = spec.max_episode_steps
+    if not isinstance(steps, int) or steps < 1:
         raise TaskError(
             f'task {name!r}{_close_to(name, {})} has no horizon, its max_episode_steps is '
             f'{spec.max_episode_steps}: register it with max_episode_steps, or choose a task that '
@@ -107,12 +112,28 @@ def find(name: str) -> Task:
     note = 'r_max is not known: 1.0, unless the setting r_max gives another unit of scores'
     return Task(
         name=name,
-        environment_id=name,
+        environment_id=environment_id,
         library='gymnasium',
-        horizon=spec.max_episode_steps,
+        horizon=steps,
         r_max=1.0,
         note=note,
     )
+
+
+def _import(name: str, module: str) -> None:
+    """Import the module of a task.
+
+    Raises:
+        TaskError: there is none of that name, or its code raised an error.
+    """
+    try:
+        modules.load(module)
+    except (Exception, SystemExit) as error:
+        raise TaskError(
+            f'task {name!r}: module {module!r} cannot be imported: {type(error).__name__}: '
+            f'{error}. Install it, start from the folder that holds it, or name that folder in '
+            'PYTHONPATH'
+        ) from error
 
 
 def _close_to(name: str, others: dict[str, Any]) -> str:
