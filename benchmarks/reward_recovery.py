@@ -63,6 +63,7 @@ VARIANTS: dict[str, dict[str, object]] = {
     'method diaster': {'method': 'diaster'},
     'method lrr': {'method': 'lrr'},
     'method lrr, independent steps': {'method': 'lrr', 'lrr.correlation': 'none'},
+    'method mil_lstm': {'method': 'mil_lstm'},
     'method mlp': {'method': 'mlp'},
     'method ircr': {'method': 'ircr'},
     'method evidence': {'method': 'evidence'},

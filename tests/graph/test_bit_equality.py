@@ -30,6 +30,7 @@ CASES = [
     (REACHER, 'random', 'lock-step'),
     (PENDULUM, 'lrr', 'lock-step'),
     (REACHER, 'diaster', 'overlap'),
+    (PENDULUM, 'mil_lstm', 'lock-step'),
     (REACHER, 'evidence', 'lock-step'),
     (PENDULUM, 'evidence', 'overlap'),
 ]

@@ -318,6 +318,14 @@ class TestLrrOfIndependentSteps(TestLrr):
     changes: ClassVar[dict[str, Any]] = {'lrr__correlation': 'none'}
 
 
+class TestMilLstm(PerceptronContract):
+    method = 'mil_lstm'
+
+
+class TestMilLstmOfEmbeddings(TestMilLstm):
+    changes: ClassVar[dict[str, Any]] = {'mil_lstm__space': 'embedding'}
+
+
 class TestMlp(PerceptronContract):
     method = 'mlp'
 

@@ -221,6 +221,30 @@ class LrrSettings(PerceptronSettings):
     )
 
 
+class MilLstmSettings(PerceptronSettings):
+    """The recurrent multiple-instance model (Early et al., arXiv 2205.15367)."""
+
+    hidden: Hidden = Field(
+        (64, 32, 32),
+        min_length=1,
+        max_length=8,
+        description='widths of the layers that embed a step',
+    )
+    space: Literal['csc', 'instance', 'embedding'] = Field(
+        'csc',
+        description="what the head reads: the LSTM's state beside the embedded step "
+        '(concatenated skip connections), or its state alone, or its last state, whose growth '
+        'step by step is then the reward',
+    )
+    width: int = Field(2, ge=1, le=65536, description='width of the LSTM')
+    head: Hidden = Field(
+        (32, 16), min_length=1, max_length=8, description='hidden layer widths of the head'
+    )
+    dropout: float = Field(0.1, ge=0, lt=1, description='dropout after each hidden layer')
+    batch: int = Field(64, ge=1, le=65536, description='segments in a gradient step')
+    learning_rate: float = Field(5e-4, gt=0, le=1, description='AdamW learning rate')
+
+
 class EvidenceSettings(Group):
     """Step rewards by Bayesian regression on scores."""
 

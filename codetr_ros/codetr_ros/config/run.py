@@ -21,6 +21,7 @@ from codetr_ros.config.methods import (
     HcSettings,
     LirpgSettings,
     LrrSettings,
+    MilLstmSettings,
     MlpSettings,
     RbtSettings,
     RrdSettings,
@@ -50,6 +51,7 @@ Method = Literal[
     'ircr',
     'diaster',
     'lrr',
+    'mil_lstm',
     'hc',
     'lirpg',
     'mlp',
@@ -188,6 +190,9 @@ class Settings(Schedule, Group):
     )
     lrr: LrrSettings = Field(
         default_factory=LrrSettings, description='likelihood reward redistribution'
+    )
+    mil_lstm: MilLstmSettings = Field(
+        default_factory=MilLstmSettings, description='the recurrent multiple-instance model'
     )
     mlp: MlpSettings = Field(
         default_factory=MlpSettings, description='the reward model of single steps'

@@ -7,6 +7,7 @@ from codetr_ros.rewards.diaster import Diaster
 from codetr_ros.rewards.evidence.method import Evidence
 from codetr_ros.rewards.ircr import Ircr
 from codetr_ros.rewards.lrr import Lrr
+from codetr_ros.rewards.mil_lstm import MilLstm
 from codetr_ros.rewards.mlp import Mlp
 from codetr_ros.rewards.rbt import Rbt
 from codetr_ros.rewards.redistribution import LastStep, Ones, Random, TrueReward, Uniform
@@ -22,6 +23,7 @@ METHODS: dict[str, type[RewardMethod]] = {
         Ircr,
         Diaster,
         Lrr,
+        MilLstm,
         Mlp,
         Evidence,
         Uniform,
