@@ -25,6 +25,21 @@ def test_the_command_says_so_by_its_exit_code(tmp_path, capsys):
     assert main(['bag', 'verify', str(tmp_path / 'none')]) == 2
 
 
+def test_recover_is_advised_only_where_it_can_mend_something(tmp_path, capsys):
+    """What it made from a bag with gaps still has the gaps."""
+    whole = a_run()
+    lost = next(i for i, r in enumerate(whole) if isinstance(r, CompositeReward))
+    bag, new = ours(tmp_path / 'bag', whole[:lost] + whole[lost + 1 :]), tmp_path / 'new'
+    (bag / 'metadata.yaml').unlink()
+    main(['bag', 'verify', str(bag)])
+    assert 'codetr bag recover' in capsys.readouterr().out
+    assert main(['bag', 'recover', str(bag), '--out', str(new)]) == 1
+    capsys.readouterr()
+    assert main(['bag', 'verify', str(new)]) == 1
+    said = capsys.readouterr().out
+    assert '--out NEW' not in said and 'has nothing to mend' in said
+
+
 def test_findings_that_are_not_printed_are_counted(tmp_path, capsys):
     """Of each kind a thousand are named."""
     records = a_run(phases=300, chunk=1)[1:]  # no segments without the run's settings

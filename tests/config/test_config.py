@@ -59,8 +59,8 @@ def test_the_papers_table_is_what_the_paper_preset_says() -> None:
         ('beta', math.nan, 'beta = nan: Input should be a finite number'),
         ('seed', 2**31, 'seed = 2147483648: Input should be less than or equal to 2147483647'),
         ('overlap', 'perhaps', "overlap = 'perhaps': Input should be a valid boolean"),
-        ('device', 'gpu', "device = 'gpu': String should match pattern"),
-        ('device', 'cuda:', "device = 'cuda:': String should match pattern"),
+        ('device', 'gpu', "device = 'gpu': must be cpu, or a GPU: cuda, or cuda and its number"),
+        ('reward_device', 'cuda:', "reward_device = 'cuda:': must be cpu, or a GPU: cuda, or"),
         ('codetr.heads', 5, 'embedding=64 is not divisible by heads=5'),
         ('task', '', "task = '': String should have at least 1 character"),
     ],
@@ -114,7 +114,7 @@ def test_every_fault_of_a_file_is_named_at_once(tmp_path: Path) -> None:
     lines = str(refused.value).splitlines()
     assert len(lines) == 3
     assert all(line.startswith(f'{file}: ') for line in lines)
-    assert f'{file}: stepz = 3: there is no such setting' in lines
+    assert f'{file}: stepz = 3: there is no such setting (did you mean steps?)' in lines
 
 
 @pytest.mark.parametrize(

@@ -84,7 +84,7 @@ def test_missing_nodes_are_named_with_what_starts_them_and_not_waited_for_in_sil
     assert f'{NAMESPACE}/learner gave up after 1 s: it waits for ' in said
     for role in ('sim', 'evaluate', 'reward', 'record'):
         assert f'{role} (start it with `{command(role)}` in this namespace)' in said
-    assert 'Parameter peer_deadline makes it wait longer' in said
+    assert 'A larger parameter peer_deadline (of `codetr train`: --peer-deadline)' in said
     assert 'Traceback' not in said
     assert nodes.report('learner')['error'] in said
 

@@ -351,7 +351,7 @@ def test_a_field_that_does_not_exist_is_named_with_those_that_do(path, expected)
         ({'score': {'topic': '/s', 'of': 'last_steps'}}, 'steps must be given if `of`'),
         (
             {'action': {'topic': 'a b', 'fields': ['data']}},
-            "action.topic = 'a b': String should match",
+            "action.topic = 'a b': must be the name of a topic, such as /joint_states",
         ),
         (
             {'action': {'topic': '/x', 'fields': ['data'], 'low': 2.0}},

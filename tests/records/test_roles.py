@@ -1,5 +1,7 @@
 """The table of roles: who publishes what to whom."""
 
+import sys
+
 import pytest
 
 from codetr_ros.cores.recorder import Recorder
@@ -90,6 +92,9 @@ def test_a_run_needs_the_roles_that_its_settings_ask_for_and_starts_the_learner_
     assert list(needed(tiny(**changes)).items()) == list(expected.items())
 
 
-def test_what_starts_a_node_is_a_command_to_be_typed():
+def test_what_starts_a_node_is_a_command_that_can_be_typed(tmp_path, monkeypatch):
+    monkeypatch.setenv('PATH', str(tmp_path))
+    assert command('evaluate') == f'{sys.prefix}/lib/sim_node/evaluate'
+    (tmp_path / 'ros2').touch(0o755)
     assert command('evaluate') == 'ros2 run sim_node evaluate'
     assert command('record') == 'ros2 run codetr_ros record'

@@ -13,6 +13,7 @@ from rclpy.parameter import Parameter
 from rosbags.highlevel import AnyReader
 
 from codetr_ros.records import PROTOCOL_VERSION, Commit, RunSpec
+from codetr_ros.records.roles import command
 from codetr_ros.ros.watch import Watcher
 from codetr_ros.runs import folder as run_folder
 from helpers.builders import step_rewards, task_spec, transitions
@@ -140,7 +141,7 @@ def test_a_node_without_a_learner_names_it_and_gives_up(ros_domain):
     assert (
         "gave up after 0.5 s: it waits for the learner, which announces a run on '/r/run'" in said
     )
-    assert 'ros2 run learner_node learner' in said
+    assert f'start `{command("learner")}` in this namespace' in said
     assert 'Traceback' not in said
 
 
@@ -151,7 +152,7 @@ def test_a_missing_role_is_named_with_what_starts_it(play):
         play.until(lambda: node.poll() is not None)
         said = output(node)
     assert node.returncode == 1
-    assert 'it waits for reward (start it with `ros2 run reward_node reward`' in said
+    assert f'it waits for reward (start it with `{command("reward")}`' in said
 
 
 def test_a_node_takes_its_settings_from_the_run_and_shows_them(play):

@@ -15,6 +15,7 @@ from codetr_ros.bags.topics import BagTopic
 from codetr_ros.bags.writer import McapWriter
 from codetr_ros.records import TOPICS, Commit, CompositeReward, RunSpec, Transitions
 from codetr_ros.records.fields import type_name
+from codetr_ros.records.roles import command
 from codetr_ros.ros import messages
 from codetr_ros.ros.link import Link
 from codetr_ros.runs import folder as run_folder
@@ -48,8 +49,8 @@ def test_who_is_missing_is_named_with_what_starts_it(ros_domain, tmp_path):
         said = output(node)
     assert node.returncode == 1
     assert (
-        'gave up after 1 s: it waits for reward (start it with `ros2 run reward_node reward` in '
-        'this namespace)' in said
+        f'gave up after 1 s: it waits for reward (start it with `{command("reward")}` in this '
+        'namespace). A larger --deadline makes it wait longer' in said
     )
     assert 'Traceback' not in said
 
@@ -126,6 +127,16 @@ def hear(listener) -> None:
     while listener.inbox:
         listener.inbox.popleft()()
         listener.times.append(time.monotonic())
+
+
+def test_a_run_that_was_stopped_is_played_to_nobody_up_to_its_last_commit(ros_domain, tmp_path):
+    records = uniform()
+    longer = SETTINGS.changed({'method': 'uniform', 'evaluate_every': 0, 'steps': 10**6})
+    bag = ours(tmp_path / 'bag', [run(longer), *records[1:]])
+    with player(bag, '--to', 'nobody', '--rate', '1000') as node:
+        said = output(node)
+    assert node.returncode == 0, said
+    assert 'played 3 of 3 phases' in said
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from codetr_ros.bags.files import COMPRESSED
 from codetr_ros.bags.mcap_file import McapFile
 from codetr_ros.bags.raw import OnDamage
 from codetr_ros.bags.sqlite_file import SqliteFile
+from codetr_ros.system.files import remedy
 
 _KINDS: dict[str, type[McapFile | SqliteFile]] = {'.mcap': McapFile, '.db3': SqliteFile}
 
@@ -72,6 +73,6 @@ def _writing(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise BagError(
-            f'{path}, to which a bag is unpacked, cannot be written: {error.strerror}: make room '
-            'there, or set TMPDIR to a folder that has some'
+            f'{path}, to which a bag is unpacked, cannot be written: {error.strerror}: '
+            f'{remedy(error)}, or set TMPDIR to another folder'
         ) from error

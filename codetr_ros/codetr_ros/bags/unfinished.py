@@ -9,7 +9,7 @@ from pathlib import Path
 
 from codetr_ros.bags.errors import BagError, BagWriteError
 from codetr_ros.bags.metadata import METADATA
-from codetr_ros.system.files import sync_folder
+from codetr_ros.system.files import remedy, sync_folder
 
 
 @contextmanager
@@ -31,8 +31,8 @@ def unfinished(folder: Path, again: str) -> Iterator[Path]:
         reason = error.__cause__ if isinstance(error, BagWriteError) else error
         assert isinstance(reason, OSError)
         raise BagError(
-            f'{folder} cannot be written: {reason.strerror}. Nothing of it is left: make room, '
-            f'and {again}'
+            f'{folder} cannot be written: {reason.strerror}. Nothing of it is left: '
+            f'{remedy(reason)} or choose another folder, and {again}'
         ) from error
 
 

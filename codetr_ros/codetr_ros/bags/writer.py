@@ -27,7 +27,7 @@ from codetr_ros.bags.errors import BagError, BagWriteError
 from codetr_ros.bags.metadata import METADATA, BagFile, render
 from codetr_ros.bags.raw import LIBRARY
 from codetr_ros.bags.topics import BagTopic, schema_text, type_hash
-from codetr_ros.system.files import atomic_write, sync_folder
+from codetr_ros.system.files import atomic_write, remedy, sync_folder
 
 CHUNK_BYTES = 64 * 1024
 """Size at which a chunk is closed by itself: the most that a killed process loses of messages not
@@ -79,7 +79,8 @@ class McapWriter:
             self._open_file()
         except OSError as error:
             raise BagWriteError(
-                f'bag {folder} cannot be made: {error.strerror}; choose another folder'
+                f'bag {folder} cannot be made: {error.strerror}. {remedy(error).capitalize()}, or '
+                'choose another folder'
             ) from error
 
     @property
@@ -240,7 +241,7 @@ class McapWriter:
             left += f' and not cut back to them ({failed.strerror}): half a chunk may follow'
         return BagWriteError(
             f'bag {self._path or self.folder} cannot be written: {error.strerror}. It holds the '
-            f'{self.size} bytes flushed before, {left}. Make room, or mend the disk: '
+            f'{self.size} bytes flushed before, {left}. {remedy(error).capitalize()}: '
             f'`codetr bag recover {self.folder} --out NEW` makes it whole; start the run again in '
             'another folder'
         )
@@ -263,5 +264,5 @@ class McapWriter:
         except OSError as error:
             raise BagWriteError(
                 f'bag {self.folder} is whole but {METADATA} cannot be written: {error.strerror}. '
-                f'Make room, and `codetr bag recover {self.folder} --out NEW` writes it'
+                f'{remedy(error).capitalize()}, and `codetr bag recover {self.folder} --out NEW` writes it'
             ) from error

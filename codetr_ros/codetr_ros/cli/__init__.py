@@ -1,7 +1,7 @@
 """The command `codetr`. Everything slow to import is imported by the command that needs it."""
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 USAGE = 2
 """Exit code for what the user can correct on the command line, the same as argparse's."""
@@ -117,7 +117,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     command = COMMANDS.get(given[0])
     if command is None:
-        return refuse(f'there is no command {given[0]!r}: commands are {", ".join(COMMANDS)}')
+        return refuse_command(given[0], given[0], COMMANDS)
     try:
         return command(given[1:])
     except KeyboardInterrupt:
@@ -127,6 +127,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # this, the interpreter complains once more when it flushes at exit.
         sys.stdout = None
         return FAILED
+
+
+def refuse_command(shown: str, given: str, known: Iterable[str]) -> int:
+    """Print that there is no such command, and which is close; returns the exit code.
+
+    Args:
+        shown: the command as it was typed, with those that it belongs to.
+        given: its own name.
+        known: the names that there are.
+    """
+    from codetr_ros.system.similar import did_you_mean
+
+    names = list(known)
+    close = did_you_mean(given, names)
+    return refuse(f'there is no command {shown!r}{close}: commands are {", ".join(names)}')
 
 
 def refuse(text: str) -> int:

@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Callable, Sequence
 
-from codetr_ros.cli import USAGE, refuse
+from codetr_ros.cli import USAGE, refuse_command
 
 HELP = """usage: codetr bag COMMAND BAG [OPTIONS]
 
@@ -62,7 +62,5 @@ def main(arguments: Sequence[str]) -> int:
         raise SystemExit(0)  # as after --help of the other commands
     command = COMMANDS.get(arguments[0])
     if command is None:
-        return refuse(
-            f'there is no command bag {arguments[0]!r}: commands are {", ".join(COMMANDS)}'
-        )
+        return refuse_command(f'bag {arguments[0]}', arguments[0], COMMANDS)
     return command(arguments[1:])

@@ -13,6 +13,9 @@ from rich.console import Console
 from codetr_ros.cli import FAILED, refuse
 from codetr_ros.runs import folder as run_folder
 
+MENDED = {'file', 'index', 'metadata'}
+"""Kinds of findings that `codetr bag recover` mends."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
@@ -79,11 +82,25 @@ def show(report: Mapping[str, Any], limit: int, console: Console) -> None:
         kinds = ', '.join(f'{count} {kind}' for kind, count in report['found'].items())
         console.print(
             f'{report["bag"]}: damaged: {total} findings ({kinds}) in {report["messages"]} '
-            f'messages. `codetr bag recover {report["bag"]} --out NEW` makes a whole bag from '
-            'what can be read',
+            f'messages. {_remedy(report)}',
             style='red',
             highlight=False,
         )
     else:
         text = f'{report["bag"]}: sound, {report["messages"]} messages'
         console.print(text, style='green')
+
+
+def _remedy(report: Mapping[str, Any]) -> str:
+    """What can be done about the findings. Only faults of files can be mended: what is missing in
+    whole files is not on the disk, and `recover` invents nothing.
+    """
+    if MENDED & set(report['found']):
+        return (
+            f'`codetr bag recover {report["bag"]} --out NEW` makes a whole bag from what can be '
+            'read'
+        )
+    return (
+        'Its files are whole, so `codetr bag recover` has nothing to mend: look for another '
+        'recording of what is missing'
+    )

@@ -20,7 +20,9 @@ if sys.platform != 'win32':
 
 SHARED_MEMORY = Path('/dev/shm')
 _NEEDED_MB = 64  # free shared memory that the nodes of a run take, with room to spare
-_INSTALL = 'run `make` in the project, or build the colcon workspace and source install/setup.bash'
+_INSTALL = (
+    'run `make setup` in the project, or build the colcon workspace and source install/setup.bash'
+)
 
 
 @dataclasses.dataclass(frozen=True)

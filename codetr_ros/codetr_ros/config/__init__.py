@@ -2,7 +2,15 @@
 parameters.
 """
 
-from codetr_ros.config.base import Group, SettingsError, explain, flatten, validate
+from codetr_ros.config.base import (
+    Group,
+    SettingsError,
+    explain,
+    flatten,
+    in_words,
+    names,
+    validate,
+)
 from codetr_ros.config.loading import (
     PRESETS,
     differences,
@@ -50,7 +58,9 @@ __all__ = [
     'explain',
     'flatten',
     'from_canonical',
+    'in_words',
     'load',
+    'names',
     'nearest',
     'parse',
     'validate',

@@ -1,9 +1,24 @@
 """The base of all settings: how they are validated, and what a refusal names."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
+
+from codetr_ros.system.similar import did_you_mean
+
+_IN_WORDS: dict[str, str] = {}
+
+
+def in_words(pattern: str, words: str) -> str:
+    """A regular expression for a setting; a refusal then explains it in words.
+
+    Args:
+        pattern: the regular expression.
+        words: what it allows, to follow 'must be'.
+    """
+    _IN_WORDS[pattern] = words
+    return pattern
 
 
 class SettingsError(ValueError):
@@ -48,15 +63,37 @@ def validate(kind: type[_G], data: Any, source: str) -> _G:
     try:
         return kind.model_validate(data)
     except ValidationError as error:
-        raise SettingsError(explain(error, source)) from None
+        raise SettingsError(explain(error, source, names(kind))) from None
 
 
-def explain(error: ValidationError, source: str) -> str:
-    """The refusals of pydantic, a line for each value: its source, name, value and the reason."""
+def names(kind: type[BaseModel], prefix: str = '') -> Iterator[str]:
+    """The dotted names of all settings of a group."""
+    for name, field in kind.model_fields.items():
+        inner = field.annotation
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            yield from names(inner, f'{prefix}{name}.')
+        else:
+            yield prefix + name
+
+
+def explain(error: ValidationError, source: str, known: Iterable[str] = ()) -> str:
+    """The refusals of pydantic, a line for each value: its source, name, value and the reason.
+
+    Args:
+        error: the refusals.
+        source: where the values came from.
+        known: the names that there are, of which one may be meant by a name that is unknown.
+    """
+    there = list(known)
     lines = []
     for e in error.errors():
         name = '.'.join(str(part) for part in e['loc']) or 'settings'
         value = '' if isinstance(e['input'], Mapping) else f' = {e["input"]!r}'
-        reason = 'there is no such setting' if e['type'] == 'extra_forbidden' else e['msg']
+        if e['type'] == 'extra_forbidden':
+            reason = f'there is no such setting{did_you_mean(name, there)}'
+        elif words := _IN_WORDS.get(e.get('ctx', {}).get('pattern', '')):
+            reason = f'must be {words}'
+        else:
+            reason = e['msg']
         lines.append(f'{source}: {name}{value}: {reason}')
     return '\n'.join(lines)

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from codetr_ros.config.base import Group, SettingsError, flatten, validate
+from codetr_ros.config.base import Group, SettingsError, flatten, in_words, validate
 from codetr_ros.config.methods import (
     CodetrSettings,
     DiasterSettings,
@@ -30,6 +30,9 @@ from codetr_ros.config.methods import (
 from codetr_ros.config.schedule import Schedule
 from codetr_ros.records import PROTOCOL_VERSION, RunSpec
 
+_DEVICE = in_words(
+    r'^(cpu|cuda(:\d{1,2})?)$', 'cpu, or a GPU: cuda, or cuda and its number, such as cuda:1'
+)
 Composite = Literal[
     'sum',
     'sum_square',
@@ -167,12 +170,12 @@ class Settings(Schedule, Group):
     threads: int = Field(1, ge=1, le=256, description='torch threads of each process')
     device: str = Field(
         'cpu',
-        pattern=r'^(cpu|cuda(:\d{1,2})?)$',
+        pattern=_DEVICE,
         description='where SAC learns: cpu, or the GPU cuda, cuda:1, ... of the learner',
     )
     reward_device: str = Field(
         'cpu',
-        pattern=r'^(cpu|cuda(:\d{1,2})?)$',
+        pattern=_DEVICE,
         description='where a reward model with a network learns and labels: cpu, or the GPU cuda, '
         'cuda:1, ... of the reward node; everything else runs on the CPU',
     )

@@ -8,7 +8,7 @@ import numpy as np
 import yaml
 from pydantic import Field, model_validator
 
-from codetr_ros.config import Group, SettingsError, validate
+from codetr_ros.config import Group, SettingsError, in_words, validate
 from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.message_fields import FieldPath, Topic, field
 from codetr_ros.offline.score_rules import Score
@@ -104,7 +104,11 @@ class Sampling(Group):
 class Mapping(Group):
     """A mapping file."""
 
-    source: str = Field('robot', pattern=r'^[A-Za-z_]\w*$', description='name of the robot')
+    source: str = Field(
+        'robot',
+        pattern=in_words(r'^[A-Za-z_]\w*$', 'a name of letters, digits and _'),
+        description='name of the robot',
+    )
     observation: tuple[Values, ...] = Field(
         min_length=1, description='topics, one after the other'
     )

@@ -7,12 +7,25 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from codetr_ros.bags.names import full_name
+from codetr_ros.config import in_words
 from codetr_ros.offline.errors import FitError
 
 NS = 10**9
 
-Topic = Annotated[str, Field(pattern=r'^/?[^\s/]\S*$'), AfterValidator(full_name)]
-FieldPath = Annotated[str, Field(pattern=r'^[A-Za-z_]\w*(\[\d+\])?(\.[A-Za-z_]\w*(\[\d+\])?)*$')]
+Topic = Annotated[
+    str,
+    Field(pattern=in_words(r'^/?[^\s/]\S*$', 'the name of a topic, such as /joint_states')),
+    AfterValidator(full_name),
+]
+FieldPath = Annotated[
+    str,
+    Field(
+        pattern=in_words(
+            r'^[A-Za-z_]\w*(\[\d+\])?(\.[A-Za-z_]\w*(\[\d+\])?)*$',
+            'the path of a number in a message, such as position[0] or pose.position.x',
+        )
+    ),
+]
 
 _PART = re.compile(r'(\w+)(?:\[(\d+)\])?$')
 

@@ -70,10 +70,30 @@ def executable(role: str, environ: Mapping[str, str] = os.environ) -> Path:
     )
 
 
+def namespace_of(run_id: str) -> str:
+    """The namespace of a run unless the user names another."""
+    return f'/run_{run_id}'
+
+
 def commands(
-    settings: Settings, run_id: str, folder: Path, environ: Mapping[str, str] = os.environ
+    settings: Settings,
+    run_id: str,
+    folder: Path,
+    environ: Mapping[str, str] = os.environ,
+    *,
+    namespace: str | None = None,
+    peer_deadline: float | None = None,
 ) -> list[Command]:
     """The processes of a run, in the order in which they start; any order would do.
+
+    Args:
+        settings: the run's settings.
+        run_id: its name.
+        folder: its folder.
+        environ: the environment in which the executables are looked for.
+        namespace: that of the run; None: `namespace_of(run_id)`.
+        peer_deadline: seconds that nodes wait for each other, 0 for ever; None: as they do by
+            themselves.
 
     Raises:
         LaunchError: an executable is missing.
@@ -82,7 +102,8 @@ def commands(
     nodes += [(role, role) for role in settings.roles if role != 'sim']
     processes = []
     for name, role in nodes:
-        arguments = [str(executable(role, environ)), '--ros-args', '-r', f'__ns:=/run_{run_id}']
+        arguments = [str(executable(role, environ)), '--ros-args']
+        arguments += ['-r', f'__ns:={namespace or namespace_of(run_id)}']
         if role == 'sim' and name != 'sim':
             arguments += ['-r', f'__node:={name}']
         parameters = {'folder': str(folder)}
@@ -91,6 +112,8 @@ def commands(
         for parameter, value in parameters.items():
             # ROS reads the value as YAML: without quotes, blanks and colons in a path break it.
             arguments += ['-p', f'{parameter}:={json.dumps(value, ensure_ascii=False)}']
+        if peer_deadline is not None:
+            arguments += ['-p', f'peer_deadline:={float(peer_deadline)}']
         processes.append(Command(name, role, tuple(arguments)))
     return processes
 

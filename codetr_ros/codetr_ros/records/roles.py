@@ -4,6 +4,8 @@ Everybody publishes `Presence` and reads it; the table leaves it out. All else a
 from here: what cores subscribe to, whom a node waits for, what a launcher starts.
 """
 
+import shutil
+import sys
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Protocol
@@ -106,8 +108,11 @@ ROLES = tuple(TABLE)
 
 
 def command(role: str) -> str:
-    """What starts a node of a role, for people."""
-    return f'ros2 run {TABLE[role].package} {TABLE[role].executable}'
+    """What starts a node of a role, for people. An installation from wheels has no `ros2`."""
+    package, executable = TABLE[role].package, TABLE[role].executable
+    if shutil.which('ros2') is None:
+        return f'{sys.prefix}/lib/{package}/{executable}'
+    return f'ros2 run {package} {executable}'
 
 
 def needed(settings: DecidingSettings) -> dict[str, int]:

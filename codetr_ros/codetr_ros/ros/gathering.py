@@ -36,7 +36,7 @@ def wait_for(member: Membership, lacks: Callable[[], Sequence[str]]) -> bool:
         if member.deadline and now - began > member.deadline:
             raise NodeError(
                 f'{member.link.full_name} gave up after {member.deadline:g} s: it {doing}. '
-                'Parameter peer_deadline makes it wait longer'
+                f'A larger {member.deadline_is} makes it wait longer'
             )
         if now - named >= NAME_EVERY:
             named = now

@@ -11,6 +11,7 @@ from typing import Any
 from codetr_ros.config import IN_PROCESS_ONLY, Settings, from_canonical
 from codetr_ros.cores.core import Core
 from codetr_ros.records import RunSpec
+from codetr_ros.records.roles import command
 from codetr_ros.ros import parameters
 from codetr_ros.ros.errors import NodeError
 from codetr_ros.ros.gathering import IDLE, wait_for
@@ -165,7 +166,7 @@ def _known(member: Membership) -> RunSpec | None:
     run_id = member.values['run_id']
     wanted = f'run {run_id!r}' if run_id else 'a run'
     topic = member.link.node.resolve_topic_name('run')
-    remedy = 'start `ros2 run learner_node learner` in this namespace'
+    remedy = f'start `{command("learner")}` in this namespace'
     lacking = [f'the learner, which announces {wanted} on {topic!r} ({remedy})']
     return member.run if wait_for(member, lambda: [] if member.run else lacking) else None
 

@@ -48,6 +48,8 @@ class Membership:
         begun: whether all peers have been present; from then on, a conflict with another node or
             run is logged and ends no node.
         doing: what the node does now, for people.
+        deadline_is: what the user sets `deadline` with, for errors.
+        again: what the user does once the obstacle is gone, for errors.
 
     Args:
         role: one of `records.ROLES`.
@@ -68,6 +70,8 @@ class Membership:
         self.announcement: Any = None
         self.begun = False
         self.doing = 'starting'
+        self.deadline_is = 'parameter peer_deadline (of `codetr train`: --peer-deadline)'
+        self.again = 'start the run again'
         self._instance = secrets.token_hex(8)
         self._serves = False  # the core is made from the run's settings
         self._fetcher: Fetcher | None = None

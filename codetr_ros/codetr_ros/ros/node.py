@@ -94,14 +94,7 @@ class Node:
     def _work(self, wiring: Wiring) -> None:
         member, core = self.member, wiring.joined.core
         work = core.work()
-        patience = Patience(
-            member.link.full_name,
-            member.role,
-            [TOPICS[kind] for kind in core.subscribes],
-            member.peers,
-            member.deadline,
-            self._log,
-        )
+        patience = Patience(member, [TOPICS[kind] for kind in core.subscribes])
         waiting: float | None = None  # since when
         while not member.stop:
             member.turn()

@@ -1,11 +1,10 @@
 """When waiting is pointless: the awaited records are lost, or their publisher is gone."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from codetr_ros.records.roles import TABLE
 from codetr_ros.ros.errors import NodeError
-from codetr_ros.ros.peers import Peers
+from codetr_ros.ros.membership import Membership
 
 NAME_EVERY = 5.0  # [s] between two warnings about the same peers
 GRACE = 10.0  # [s] for records that a peer published before it finished
@@ -15,29 +14,19 @@ class Patience:
     """Watches over a node that waits during the run.
 
     Args:
-        who: fully qualified name of the node.
-        role: its role.
+        member: the node.
         topics: those on which the awaited records arrive.
-        peers: the other nodes.
-        deadline: seconds to wait; 0: for ever.
-        log: the node's logger.
     """
 
-    def __init__(
-        self,
-        who: str,
-        role: str,
-        topics: Sequence[str],
-        peers: Peers,
-        deadline: float,
-        log: Any,
-    ) -> None:
-        self._who = who
-        self._role = role
+    def __init__(self, member: Membership, topics: Sequence[str]) -> None:
+        self._who = member.link.full_name
+        self._role = member.role
         self._topics = topics
-        self._peers = peers
-        self._deadline = deadline
-        self._log = log
+        self._peers = member.peers
+        self._deadline = member.deadline
+        self._limit = f'{member.deadline_is}: {member.deadline:g} s'
+        self._again = member.again
+        self._log = member.log
         self._named: dict[str, float] = {}
 
     def check(self, now: float, waiting: float, doing: str, lost: Mapping[str, int]) -> None:
@@ -59,9 +48,8 @@ class Patience:
             lacking = ', '.join(f'{n} of {topic!r}' for topic, n in sorted(lost.items()))
             raise NodeError(
                 f'{self._who} gave up after {waiting:.0f} s: it {doing}, and messages that were '
-                f'published never reached it: {lacking} (parameter peer_deadline = '
-                f'{self._deadline:g}). Look for an overloaded machine or network, and start the '
-                'run again'
+                f'published never reached it: {lacking} ({self._limit}). Look for an overloaded '
+                f'machine or network, and {self._again}'
             )
 
     def _check_silent(self, now: float, waiting: float, doing: str) -> None:
@@ -73,8 +61,7 @@ class Patience:
             if self._deadline and silent > self._deadline and waiting > self._deadline:
                 raise NodeError(
                     f'{self._who} gave up: it {doing}, and {who} has been silent for '
-                    f'{silent:.0f} s (parameter peer_deadline = {self._deadline:g}). Look at its '
-                    f'log, and start the run again'
+                    f'{silent:.0f} s ({self._limit}). Look at its log, and {self._again}'
                 )
             if now - self._named.get(who, 0.0) > NAME_EVERY:
                 self._named[who] = now
@@ -90,5 +77,5 @@ class Patience:
                 names = ', '.join(peer.presence.node for peer in gone)
                 raise NodeError(
                     f'{self._who} gave up: it {doing}, but {role} {names} stopped before the run '
-                    f'was over. Look at its log, and start the run again'
+                    f'was over. Look at its log, and {self._again}'
                 )

@@ -80,6 +80,7 @@ class Cast:
             return True
         member = Membership(role, name, self._recorder.stop)
         member.log.set_level(LoggingSeverity.WARN)  # the player logs the rest once
+        member.deadline_is, member.again = self._recorder.deadline_is, self._recorder.again
         self._links[role, name if role == 'sim' else ''] = member.link
         self._recorder.company.append(member)
         recorded = self._recorded

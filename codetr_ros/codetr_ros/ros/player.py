@@ -110,7 +110,8 @@ class Playing(PlayedWiring):
             NodeError: the run of the live nodes differs from it, or has no such nodes.
         """
         settings = self.joined.settings
-        check_settings(self._recorded, settings)
+        if 'learner' in self._live:  # whoever else is live takes the recorded settings
+            check_settings(self._recorded, settings)
         self._check_labels(settings)
         if unknown := [role for role in self._live if role not in settings.roles]:
             raise NodeError(
@@ -260,6 +261,7 @@ class Player:
         self._pace = pace
         self._playing: Playing | None = None
         self._member = Membership('record', 'record', stop)
+        self._member.deadline_is, self._member.again = '--deadline', 'play again'
         self._cast = Cast(self._member, self._recorded, live)
 
     def run(self) -> int:

@@ -1,13 +1,12 @@
 """The folder of a run and the places in it."""
 
-import os
 import re
 from pathlib import Path
 
 import yaml
 
 from codetr_ros import config
-from codetr_ros.system.files import atomic_write
+from codetr_ros.system.files import FileError, atomic_write, check_writable
 
 CONFIG = 'config.yaml'
 BAG = 'bag'
@@ -35,11 +34,10 @@ def check(path: Path) -> None:
     if path.exists():
         if not path.is_dir():
             raise RunFolderError(f'output folder {path} is a file: choose another with --out')
-        if not os.access(path, os.W_OK | os.X_OK):
-            raise RunFolderError(
-                f'output folder {path} cannot be written: change its permissions or choose '
-                'another with --out'
-            )
+        try:
+            check_writable(path)
+        except FileError as error:
+            raise RunFolderError(f'output folder {error} with --out') from None
         if names := sorted(entry.name for entry in path.iterdir()):
             shown = ', '.join(names[:3]) + (', ...' if len(names) > 3 else '')
             raise RunFolderError(
@@ -50,11 +48,10 @@ def check(path: Path) -> None:
     parent = path.absolute().parent
     while not parent.exists():
         parent = parent.parent
-    if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
-        raise RunFolderError(
-            f'output folder {path} cannot be made, {parent} cannot be written: change its '
-            'permissions or choose another with --out'
-        )
+    try:
+        check_writable(parent)
+    except FileError as error:
+        raise RunFolderError(f'output folder {path} cannot be made, {error} with --out') from None
 
 
 def create(path: Path) -> Path:

@@ -4,8 +4,21 @@ Every file is written under a temporary name, synced to the disk and renamed. A 
 machine that has lost its power, then sees the whole old file or the whole new one, never a part.
 """
 
+import errno
 import os
+import tempfile
 from pathlib import Path
+
+_REMEDIES = {
+    errno.ENOSPC: 'make room',
+    errno.EDQUOT: 'make room within the quota',
+    errno.EACCES: 'change the permissions',
+    errno.EPERM: 'change the permissions',
+    errno.EROFS: 'mount the disk so that it can be written',
+    errno.EIO: 'mend the disk',
+    errno.EMFILE: 'raise the limit of open files (ulimit -n)',
+    errno.EFBIG: 'raise the limit of file sizes (ulimit -f)',
+}
 
 
 class FileError(OSError):
@@ -13,9 +26,30 @@ class FileError(OSError):
 
     def __str__(self) -> str:
         return (
-            f'{self.filename} cannot be written: {self.strerror}. Make room, or choose another '
-            'folder'
+            f'{self.filename} cannot be written: {self.strerror}. {remedy(self).capitalize()}, or '
+            'choose another folder'
         )
+
+
+def remedy(error: OSError) -> str:
+    """What lets a file be written that could not be, as the beginning of a sentence."""
+    return _REMEDIES.get(error.errno or 0, 'remove the cause')
+
+
+def check_writable(folder: Path) -> None:
+    """Check that files can be written in a folder; leaves nothing in it.
+
+    The permissions alone do not decide: a disk may be mounted to be read only, and root is denied
+    nothing but that.
+
+    Raises:
+        FileError: there is no such folder, or it cannot be written.
+    """
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise FileError(error.errno, error.strerror, str(folder)) from error
 
 
 def sync_folder(folder: Path) -> None:
