@@ -83,7 +83,7 @@ def test_what_is_no_bag_is_refused(tmp_path, capsys):
     assert main(['bag', 'info', str(tmp_path)]) == 2
     assert 'holds no file of .mcap or .db3' in capsys.readouterr().err
     assert main(['bag', 'turn']) == 2
-    assert "no command bag 'turn'" in capsys.readouterr().err
+    assert "no command 'bag turn'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('wrong', [math.nan, math.inf, -math.inf])

@@ -19,7 +19,7 @@ def bag(tmp_path):
     [
         (['--rate', '0'], '--rate 0 must be greater than 0'),
         (['--rate', 'nan'], '--rate nan must be greater than 0'),
-        (['--deadline', '-1'], '--deadline -1 must be from 0 to 86400'),
+        (['--deadline', '-1'], '--deadline -1 must be from 0 to 86400 seconds; 0: for ever'),
         (
             ['--to', 'nobody'],
             '--to nobody needs --pace recorded or --rate: no node sets the pace',

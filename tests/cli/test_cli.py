@@ -113,6 +113,10 @@ def test_help_shows_the_defaults_and_ranges_of_the_chosen_config(
         ('--delay 1001', 'delay = 1001: task '),
         ('--method true', 'Add --in-process'),
         ('--method ones', '--method ones is a reference'),
+        ('--device gpu', "device = 'gpu': must be cpu, or a GPU: cuda, or cuda and its number"),
+        ('--namespace lab', "--namespace 'lab' must be a ROS namespace: /name"),
+        ('--namespace /lab --in-process', '--in-process starts none: leave out one of them'),
+        ('--peer-deadline -1', '--peer-deadline -1 must be from 0 to 86400 seconds'),
     ],
 )
 def test_what_cannot_be_trained_is_refused_before_anything_is_made(
@@ -184,12 +188,22 @@ def test_commands_and_their_help_are_listed(capsys: pytest.CaptureFixture[str]) 
         assert f'usage: codetr {name}' in capsys.readouterr().out
 
 
-@pytest.mark.parametrize('arguments', [[], ['trian']])
+@pytest.mark.parametrize(
+    ('arguments', 'close'),
+    [
+        ([], ''),
+        (['trian'], "no command 'trian' (did you mean train?)"),
+        (['bag', 'recovr'], "no command 'bag recovr' (did you mean recover?)"),
+        (['xyz'], "no command 'xyz': commands are"),
+    ],
+)
 def test_no_command_or_an_unknown_one_is_refused_with_those_there_are(
-    arguments: Sequence[str], capsys: pytest.CaptureFixture[str]
+    arguments: Sequence[str], close: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(arguments) == 2
-    assert 'evaluate' in capsys.readouterr().err
+    shown = capsys.readouterr().err
+    assert close in shown
+    assert 'recover' in shown if arguments[:1] == ['bag'] else 'evaluate' in shown
 
 
 def test_the_command_line_loads_nothing_slow_before_it_must() -> None:
@@ -357,9 +371,13 @@ def test_the_run_over_topics_fails_with_the_log_of_the_node_that_died(
         launcher.executable(role).write_text(waits)
     launcher.executable('reward').write_text('#!/bin/sh\necho out of patience >&2\nexit 7\n')
 
-    assert cli.main(['train', '--out', str(tmp_path / 'run')]) == 1
+    assert cli.main(['train', '--out', str(tmp_path / 'run'), '--namespace', '/lab']) == 1
 
     shown = capfd.readouterr()
+    assert 'namespace: /lab\n' in shown.out
+    for name in ('sim', 'learner'):
+        called = (tmp_path / 'run' / run_folder.LOGS / f'{name}.log').read_text()
+        assert ' __ns:=/lab ' in called and called.splitlines()[0].endswith('peer_deadline:=60.0')
     assert 'the run failed: reward ended with exit code 7' in shown.err
     assert 'out of patience' in shown.err
     said = json.loads((tmp_path / 'run' / run_folder.SUMMARY).read_text())

@@ -209,6 +209,20 @@ def test_each_node_is_told_its_namespace_and_folder_and_the_learner_the_settings
     )
 
 
+def test_nodes_get_the_namespace_and_the_deadline_that_the_user_gives(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, 'prefix', str(prefix(tmp_path)))
+
+    made = launcher.commands(
+        config.load('quick'), 'r1', tmp_path, {}, namespace='/lab/a', peer_deadline=0
+    )
+
+    for command in made:
+        assert '__ns:=/lab/a' in command.arguments
+        assert command.arguments[-2:] == ('-p', 'peer_deadline:=0.0')
+
+
 def test_no_evaluator_is_started_where_nothing_is_evaluated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -36,6 +36,15 @@ def test_a_folder_that_holds_something_is_refused_and_left_alone(tmp_path: Path)
     assert len(list(tmp_path.iterdir())) == 4
 
 
+def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(tmp_path: Path) -> None:
+    name = tmp_path / 'runs' / 'task-20260101-120000'
+
+    folders = [run_folder.create_next(name) for _ in range(3)]
+
+    assert [folder.name.removeprefix(name.name) for folder in folders] == ['', '-2', '-3']
+    assert all((folder / run_folder.NODES).is_dir() for folder in folders)
+
+
 def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path: Path) -> None:
     file = tmp_path / 'file'
     file.touch()

@@ -6,9 +6,8 @@ from typing import Any
 
 import pytest
 
-from codetr_ros.cli import train
+from codetr_ros.cli import results
 from codetr_ros.config import Settings
-from codetr_ros.processes.supervise import Interrupts
 from codetr_ros.records import metrics
 from codetr_ros.runs import facts, report, summary
 from codetr_ros.runs import folder as run_folder
@@ -198,39 +197,30 @@ def test_what_was_not_heard_is_taken_from_the_bag(tmp_path):
     for record in a_run()[3:]:
         late.receive(record)
     assert late.build({}).random is None
-    train._complete(late, tmp_path, progress, Interrupts())
+    results.complete(late, tmp_path / run_folder.BAG, progress.log)
     assert told(late) == told(heard)
-    assert stream.getvalue().splitlines() == ['reading the bag for the summary']
+    assert stream.getvalue() == ''
 
     file = next(bag.glob('*.mcap'))
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    train._complete(late, tmp_path, progress, Interrupts())
+    results.complete(late, tmp_path / run_folder.BAG, progress.log)
     assert told(late) == told(heard)
     assert 'what was received' in stream.getvalue()
 
 
 def test_ctrl_c_ends_the_reading_of_the_bag_and_the_summary_is_written_all_the_same(tmp_path):
     ours(tmp_path / run_folder.BAG, a_run())
-    interrupts = Interrupts()
-
-    class Impatient(io.StringIO):
-        """Of somebody who interrupts whatever is said."""
-
-        def write(self, text: str) -> int:
-            interrupts.count += 1
-            return super().write(text)
-
-    stream, late = Impatient(), Summary(SETTINGS, 'r', False, Clock())
-    progress = Progress(SETTINGS, stream, live=False, clock=Clock())
-    train._complete(late, tmp_path, progress, interrupts)
-    assert 'stopped: the summary holds what was read until now' in stream.getvalue()
+    late = Summary(SETTINGS, 'r', False, Clock())
+    logged: list[str] = []
+    results.complete(late, tmp_path / run_folder.BAG, logged.append, lambda: True)
+    assert logged == ['stopped: the summary holds what was read until now']
     assert late.build({}).evaluations == []
 
 
 def test_reward_recovery_without_all_true_rewards_is_said_not_to_be_told(tmp_path):
-    ours(tmp_path / run_folder.BAG, [*a_run(), step_rewards(phase=0, source='sim')])
+    ours(tmp_path / run_folder.BAG, [*a_run(), step_rewards(run_id='r', phase=0, source='sim')])
     stream, late = io.StringIO(), Summary(SETTINGS, 'r', False, Clock())
     progress = Progress(SETTINGS, stream, live=False, clock=Clock())
-    train._complete(late, tmp_path, progress, Interrupts())
+    results.complete(late, tmp_path / run_folder.BAG, progress.log)
     assert "reward recovery is incomplete: 'sim' published no true rewards" in stream.getvalue()
     assert late.build({}).evaluations, 'all else is told'

@@ -264,5 +264,6 @@ class McapWriter:
         except OSError as error:
             raise BagWriteError(
                 f'bag {self.folder} is whole but {METADATA} cannot be written: {error.strerror}. '
-                f'{remedy(error).capitalize()}, and `codetr bag recover {self.folder} --out NEW` writes it'
+                f'{remedy(error).capitalize()}, and `codetr bag recover {self.folder} --out NEW` '
+                'writes it'
             ) from error

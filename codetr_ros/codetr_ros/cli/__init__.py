@@ -18,6 +18,7 @@ commands:
   fit        fit a reward model to bags, without any node
   label      write a bag with a reward model's step rewards added
   convert    make a bag for `fit` from ordinary topics, by a mapping file
+  report     make the summary, report and pictures of a run, however it was started
   evaluate   evaluate the policy of a run's newest checkpoint
   benchmark  do many runs under one protocol, and make a table of them
   bag        show, check, recover or play a bag
@@ -59,6 +60,12 @@ def _evaluate(arguments: Sequence[str]) -> int:
     return evaluate.main(arguments)
 
 
+def _report(arguments: Sequence[str]) -> int:
+    from codetr_ros.cli import report
+
+    return report.main(arguments)
+
+
 def _benchmark(arguments: Sequence[str]) -> int:
     from codetr_ros.cli import benchmark
 
@@ -89,6 +96,7 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     'label': _label,
     'convert': _convert,
     'evaluate': _evaluate,
+    'report': _report,
     'benchmark': _benchmark,
     'bag': _bag,
     'tasks': _tasks,

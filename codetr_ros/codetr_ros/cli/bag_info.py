@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from codetr_ros.cli import refuse
+from codetr_ros.cli.terminal import console, parse_arguments
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.numbers import exact
 
@@ -30,8 +31,11 @@ class Arguments:
 
 def main(arguments: Sequence[str]) -> int:
     """Read and print; returns the exit code."""
-    given = tyro.cli(
-        Arguments, prog='codetr bag info', args=arguments, config=(tyro.conf.FlagCreatePairsOff,)
+    given = parse_arguments(
+        Arguments,
+        prog='codetr bag info',
+        arguments=arguments,
+        config=(tyro.conf.FlagCreatePairsOff,),
     )
     from codetr_ros.bags.errors import BagError
     from codetr_ros.bags.info import survey
@@ -43,7 +47,7 @@ def main(arguments: Sequence[str]) -> int:
     if given.json:
         print(json.dumps(contents, indent=2, allow_nan=False))
     else:
-        show(contents, Console(markup=False))  # names in a bag may look like markup
+        show(contents, console(tables=True))
     return 0
 
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -10,10 +9,10 @@ from typing import Annotated, Literal
 import tyro
 
 from codetr_ros.cli import refuse
+from codetr_ros.cli.terminal import parse_arguments
 from codetr_ros.processes import middleware
 
 DEFAULT_NAMESPACE = '/play'
-_NAMESPACE = re.compile(r'/|(/[A-Za-z_][A-Za-z0-9_]*)+')
 
 
 def _option(text: str, metavar: str | None = None) -> object:
@@ -56,20 +55,21 @@ class Arguments:
 
 def main(arguments: Sequence[str]) -> int:
     """Play a bag; returns the exit code."""
-    given = tyro.cli(
-        Arguments, prog='codetr bag play', args=arguments, config=(tyro.conf.FlagCreatePairsOff,)
+    given = parse_arguments(
+        Arguments,
+        prog='codetr bag play',
+        arguments=arguments,
+        config=(tyro.conf.FlagCreatePairsOff,),
     )
     live = tuple(role for role in given.to if role != 'nobody')
     recorded_pace = given.pace == 'recorded' or given.rate is not None
     if given.rate is not None and not given.rate > 0:
         return refuse(f'--rate {given.rate:g} must be greater than 0')
-    if not 0 <= given.deadline <= 86_400:
-        return refuse(f'--deadline {given.deadline:g} must be from 0 to 86400')
-    if not _NAMESPACE.fullmatch(given.namespace):
-        return refuse(
-            f'--namespace {given.namespace!r} must be a ROS namespace: /name, of letters, digits '
-            'and _, not beginning with a digit'
-        )
+    if wrong := (
+        middleware.wrong_seconds('--deadline', given.deadline)
+        or middleware.wrong_namespace(given.namespace)
+    ):
+        return refuse(wrong)
     if live != given.to and live:
         return refuse(f'--to {" ".join(given.to)}: either nobody, or nodes')
     if 'evaluate' in live and 'learner' not in live:

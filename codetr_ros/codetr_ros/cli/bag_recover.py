@@ -10,6 +10,7 @@ import tyro
 from rich.console import Console
 
 from codetr_ros.cli import FAILED, refuse
+from codetr_ros.cli.terminal import console, parse_arguments
 from codetr_ros.runs import folder as run_folder
 
 SHOWN = 20
@@ -36,10 +37,10 @@ class Arguments:
 
 def main(arguments: Sequence[str]) -> int:
     """Recover and print; returns the exit code."""
-    given = tyro.cli(
+    given = parse_arguments(
         Arguments,
         prog='codetr bag recover',
-        args=arguments,
+        arguments=arguments,
         config=(tyro.conf.FlagCreatePairsOff,),
     )
     from codetr_ros.bags.errors import BagError
@@ -52,8 +53,7 @@ def main(arguments: Sequence[str]) -> int:
     if given.json:
         print(json.dumps(recovered.report(), indent=2, allow_nan=False))
     else:
-        # names in a bag may look like markup
-        show(recovered.report(), Console(soft_wrap=True, markup=False))
+        show(recovered.report(), console())
     return 0 if recovered.whole else FAILED
 
 

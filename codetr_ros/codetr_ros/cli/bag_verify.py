@@ -11,6 +11,7 @@ import tyro
 from rich.console import Console
 
 from codetr_ros.cli import FAILED, refuse
+from codetr_ros.cli.terminal import console, parse_arguments
 from codetr_ros.runs import folder as run_folder
 
 MENDED = {'file', 'index', 'metadata'}
@@ -39,8 +40,11 @@ class Arguments:
 
 def main(arguments: Sequence[str]) -> int:
     """Read, compare and print; returns the exit code."""
-    given = tyro.cli(
-        Arguments, prog='codetr bag verify', args=arguments, config=(tyro.conf.FlagCreatePairsOff,)
+    given = parse_arguments(
+        Arguments,
+        prog='codetr bag verify',
+        arguments=arguments,
+        config=(tyro.conf.FlagCreatePairsOff,),
     )
     from codetr_ros.bags.errors import BagError
     from codetr_ros.bags.verify import verify
@@ -52,8 +56,7 @@ def main(arguments: Sequence[str]) -> int:
     if given.json:
         print(json.dumps(verdict.report(), indent=2, allow_nan=False))
     else:
-        # names in a bag may look like markup
-        show(verdict.report(), given.limit, Console(soft_wrap=True, markup=False))
+        show(verdict.report(), given.limit, console())
     return 0 if verdict.sound else FAILED
 
 

@@ -3,11 +3,12 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from codetr_ros.cli import FAILED, INTERRUPTED, refuse
+from codetr_ros.cli.terminal import parse_arguments
 from codetr_ros.processes.supervise import Interrupts
 
 
@@ -68,15 +69,15 @@ class Report:
 
 def main(arguments: Sequence[str]) -> int:
     """Carry out the command line; returns the exit code."""
-    kinds = (
+    kinds: Any = (
         Annotated[Run, tyro.conf.subcommand('run')]
         | Annotated[Report, tyro.conf.subcommand('report')]
     )
-    given: Run | Report = tyro.cli(
+    given: Run | Report = parse_arguments(
         kinds,
         prog='codetr benchmark',
         description='Do many runs under one protocol, and make a table of them.',
-        args=arguments,
+        arguments=arguments,
     )
     return _run(given) if isinstance(given, Run) else _report(given)
 

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from codetr_ros.bags.errors import BagError
 from codetr_ros.cli import refuse
+from codetr_ros.cli.terminal import console, parse_arguments
 from codetr_ros.config import SettingsError
 from codetr_ros.offline.errors import FitError
 from codetr_ros.records import RecordError
@@ -32,7 +32,7 @@ class Arguments:
 
 def main(arguments: Sequence[str]) -> int:
     """Convert and print a summary; returns the exit code."""
-    given = tyro.cli(Arguments, prog='codetr convert', args=arguments)
+    given = parse_arguments(Arguments, prog='codetr convert', arguments=arguments)
     from codetr_ros.bags.reader import Bag
     from codetr_ros.offline import mapping
     from codetr_ros.offline.conversion import HINTS
@@ -57,10 +57,10 @@ def main(arguments: Sequence[str]) -> int:
         'dropped': lost or 'nothing',
         'output': given.out,
     }
-    console = Console(highlight=False, soft_wrap=True)
+    shown = console()
     for name, text in rows.items():
-        console.print(f'{name:<12}{text}', markup=False)
+        shown.print(f'{name:<12}{text}')
     for what, hint in HINTS.items():
         if what in made.dropped:
-            console.print(f'{"hint":<12}{what}: {hint}', markup=False)
+            shown.print(f'{"hint":<12}{what}: {hint}')
     return 0

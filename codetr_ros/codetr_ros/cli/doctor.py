@@ -244,12 +244,12 @@ class Arguments:
 
 def main(arguments: Sequence[str]) -> int:
     """Print a line for each check; exit code 1 if one fails."""
-    import tyro
-    from rich.console import Console
     from rich.text import Text
 
-    tyro.cli(Arguments, prog='codetr doctor', args=arguments)
-    console = Console(highlight=False)
+    from codetr_ros.cli.terminal import console, parse_arguments
+
+    parse_arguments(Arguments, prog='codetr doctor', arguments=arguments)
+    shown = console()
     failed = 0
     colours = {'ok': 'green', 'warn': 'yellow', 'fail': 'bold red'}
     for look in CHECKS:
@@ -257,8 +257,8 @@ def main(arguments: Sequence[str]) -> int:
         for check in result if isinstance(result, list) else [result]:
             line = Text(f'{check.status:4}  ', style=colours[check.status])
             line.append(f'{check.name}: {check.detail}', style='default')
-            console.print(line, soft_wrap=True)
+            shown.print(line)
             if check.remedy:
-                console.print(Text(f'      -> {check.remedy}'), soft_wrap=True)
+                shown.print(f'      -> {check.remedy}')
             failed += check.status == 'fail'
     return 1 if failed else 0

@@ -7,10 +7,10 @@ from typing import Annotated
 
 import numpy as np
 import tyro
-from rich.console import Console
 from rich.table import Table
 
 from codetr_ros.cli import refuse
+from codetr_ros.cli.terminal import console, parse_arguments
 from codetr_ros.config import Settings, SettingsError
 from codetr_ros.records import EpisodeResult, Policy
 from codetr_ros.runs import folder as run_folder
@@ -39,7 +39,7 @@ class Arguments:
 
 def main(arguments: Sequence[str]) -> int:
     """Evaluate and print; returns the exit code."""
-    given = tyro.cli(Arguments, prog='codetr evaluate', args=arguments)
+    given = parse_arguments(Arguments, prog='codetr evaluate', arguments=arguments)
     folder = Path(given.run_dir)
     try:
         settings = run_folder.read_settings(folder)
@@ -66,13 +66,12 @@ def main(arguments: Sequence[str]) -> int:
         results = evaluate(policy, settings)
     except (RunFolderError, CheckpointError, LearnerError, TaskError) as error:
         return refuse(str(error))
-    console = Console()
-    console.print(
+    shown = console(tables=True)
+    shown.print(
         f'{settings.task}: policy after {settings.steps_after(policy.version)} steps, '
         f'{len(results)} episodes, seed {settings.seed}',
-        highlight=False,
     )
-    console.print(table(results))
+    shown.print(table(results))
     return 0
 
 

@@ -14,6 +14,7 @@ from codetr_ros import config
 from codetr_ros.bags.errors import BagError
 from codetr_ros.cli import FAILED, refuse
 from codetr_ros.cli.flags import HELP_ALL_FIELD, explained, settings_fields
+from codetr_ros.cli.terminal import console, parse_arguments
 from codetr_ros.config import Settings, SettingsError
 from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.settings import OF_NO_EFFECT, FitSettings
@@ -98,7 +99,9 @@ def parse(arguments: Sequence[str], base: Settings) -> Arguments:
     words, shown, text = explained(arguments, base, DESCRIPTION, OF_NO_EFFECT)
     kind = dataclasses.make_dataclass('Arguments', [*own, *fit, *shown], frozen=True)
     kind.__doc__ = text
-    values = dataclasses.asdict(tyro.cli(kind, prog='codetr fit', description=text, args=words))
+    values = dataclasses.asdict(
+        parse_arguments(kind, prog='codetr fit', description=text, arguments=words)
+    )
     mine = {field[0]: values.pop(field[0]) for field in own}
     fitting = {field[0]: values.pop(field[0]) for field in fit}
     return Arguments(
@@ -142,7 +145,7 @@ def _epochs(arguments: Sequence[str], given: Arguments) -> int:
     if given.frozen:
         raise FitError('--frozen: a frozen model is not fitted; it is for --schedule phases')
     start = saved.read(Path(given.checkpoint)) if given.checkpoint else None
-    index, console = _index(given)
+    index, shown = _index(given)
     base = start.settings if start else index.base()
     base = config.load(given.config) if given.config else base
     given = parse(arguments, base.changed(index.facts()))
@@ -155,7 +158,7 @@ def _epochs(arguments: Sequence[str], given: Arguments) -> int:
     method = saved.restore(start, settings, *sizes) if start else None
     folder = results.make_folder(given.out)
     run_folder.write_settings(folder, settings)
-    console.print(
+    shown.print(
         f'method {settings.method}, delay {settings.delay}: {len(plan.learnt)} stretches to learn '
         f'from in {plan.passes} {"part" if plan.passes == 1 else "parts"}, '
         f'{len(plan.held_out)} held out'
@@ -166,7 +169,7 @@ def _epochs(arguments: Sequence[str], given: Arguments) -> int:
         sizes,
         settings,
         given.fit,
-        lambda check: console.print(_line(check, given.fit), markup=False),
+        lambda check: shown.print(_line(check, given.fit)),
         method,
     )
     meta = {
@@ -182,7 +185,7 @@ def _epochs(arguments: Sequence[str], given: Arguments) -> int:
     summary = results.of_epochs(fitted, index, data, settings, given.fit, judged)
     results.write(folder, summary)
     report.write(folder, summary, judged)
-    results.show(summary, folder, console)
+    results.show(summary, folder, shown)
     return 0
 
 
@@ -199,13 +202,13 @@ def _index(given: Arguments) -> 'tuple[Index, Console]':
     from codetr_ros.offline.episodes import Index
     from codetr_ros.offline.sources import open_bags
 
-    console = Console(highlight=False, soft_wrap=True)
+    shown = console()
     index = Index(open_bags(given.bags), given.run).read()
-    console.print(
+    shown.print(
         f'{len(index.bags)} {"bag" if len(index.bags) == 1 else "bags"}: {index.steps} steps, '
         f'{index.scores} scores, {len(index.episodes)} episodes'
     )
-    return index, console
+    return index, shown
 
 
 def _refuse_unfit(settings: Settings) -> None:
@@ -241,8 +244,8 @@ def _phases(arguments: Sequence[str], given: Arguments) -> int:
     live = results.live_digest(bag)
     folder = results.make_folder(given.out)
     run_folder.write_settings(folder, given.settings)
-    index, console = _index(given)
-    console.print(
+    index, shown = _index(given)
+    shown.print(
         f'run {run.run_id}: {own.task}, method {given.settings.method}, {own.phases} phases'
     )
     began = time.perf_counter()
@@ -251,8 +254,8 @@ def _phases(arguments: Sequence[str], given: Arguments) -> int:
         run,
         given.settings,
         folder / run_folder.CHECKPOINTS,
-        lambda text: console.print(text, style='yellow', markup=False),
-        lambda phase, of: console.print(f'phase {phase} of {of}'),
+        lambda text: shown.print(text, style='yellow', markup=False),
+        lambda phase, of: shown.print(f'phase {phase} of {of}'),
         given.checkpoint,
         given.frozen,
     )
@@ -267,5 +270,5 @@ def _phases(arguments: Sequence[str], given: Arguments) -> int:
     summary = results.of_phases(folded, index, data, own, given.fit, judged, seconds, live)
     results.write(folder, summary)
     report.write(folder, summary, judged)
-    results.show(summary, folder, console)
+    results.show(summary, folder, shown)
     return 0

@@ -14,6 +14,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from codetr_ros import config
+from codetr_ros.cli.terminal import parse_arguments
 from codetr_ros.config import Settings, SettingsError
 from codetr_ros.runs.numbers import exact
 
@@ -161,7 +162,9 @@ def parse(
     given, fields, description = explained(arguments, base, description)
     kind = dataclasses.make_dataclass('Arguments', [*own, *fields], frozen=True)
     kind.__doc__ = description
-    values = dataclasses.asdict(tyro.cli(kind, prog=prog, description=description, args=given))
+    values = dataclasses.asdict(
+        parse_arguments(kind, prog=prog, description=description, arguments=given)
+    )
     extra = {field[0]: values.pop(field[0]) for field in own}
     settings = config.parse(values, 'command line')
     return settings, extra

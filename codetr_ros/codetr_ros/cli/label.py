@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from codetr_ros.bags.errors import BagError
 from codetr_ros.cli import FAILED, refuse
+from codetr_ros.cli.terminal import console, parse_arguments
 from codetr_ros.config import SettingsError
 from codetr_ros.offline.errors import FitError
 from codetr_ros.records import RecordError
@@ -48,7 +48,7 @@ class Arguments:
 
 def main(arguments: Sequence[str]) -> int:
     """Label and print what was labelled; returns the exit code."""
-    given = tyro.cli(Arguments, prog='codetr label', args=arguments)
+    given = parse_arguments(Arguments, prog='codetr label', arguments=arguments)
     if given.memory_steps < 1:
         return refuse(f'--memory-steps {given.memory_steps}: at least 1 step must be held')
     from codetr_ros.offline import labelling, sources
@@ -69,7 +69,7 @@ def main(arguments: Sequence[str]) -> int:
     except (RewardModelError, DeviceError) as error:
         print(f'codetr: {error}', file=sys.stderr)
         return FAILED
-    console = Console(highlight=False, soft_wrap=True)
+    shown = console()
     skipped = ', '.join(f'{n} {name}' for name, n in made.skipped.items() if n)
     rows = {
         'labelled': f'{made.segments} segments, {made.steps} steps, on '
@@ -80,5 +80,5 @@ def main(arguments: Sequence[str]) -> int:
         'output': given.out,
     }
     for name, text in rows.items():
-        console.print(f'{name:<16}{text}', markup=False)
+        shown.print(f'{name:<16}{text}')
     return 0

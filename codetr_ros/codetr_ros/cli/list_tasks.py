@@ -3,10 +3,9 @@
 import dataclasses
 from collections.abc import Sequence
 
-import tyro
-from rich.console import Console
 from rich.table import Table
 
+from codetr_ros.cli.terminal import console, parse_arguments
 from codetr_ros.runs.numbers import exact
 from codetr_ros.simulation import tasks
 
@@ -18,7 +17,7 @@ class Arguments:
 
 def main(arguments: Sequence[str]) -> int:
     """Print the table."""
-    tyro.cli(Arguments, prog='codetr tasks', args=arguments)
+    parse_arguments(Arguments, prog='codetr tasks', arguments=arguments)
     table = Table(box=None, pad_edge=False)
     for column, justify in (
         ('task', 'left'),
@@ -33,9 +32,7 @@ def main(arguments: Sequence[str]) -> int:
             task.library, task.library
         )
         table.add_row(task.name, library, str(task.horizon), exact(task.r_max), task.note)
-    console = Console()
-    console.print(table)
-    console.print(
-        '\nAny other Gymnasium id with Box spaces works as well: --task Pusher-v5', highlight=False
-    )
+    shown = console(tables=True)
+    shown.print(table)
+    shown.print('\nAny other Gymnasium id with Box spaces works as well: --task Pusher-v5')
     return 0

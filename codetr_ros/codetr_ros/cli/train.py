@@ -10,38 +10,25 @@ import traceback
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
-from rich.console import Console
-from rich.table import Table
 
 from codetr_ros import config
-from codetr_ros.cli import FAILED, INTERRUPTED, refuse
+from codetr_ros.cli import FAILED, INTERRUPTED, refuse, results
 from codetr_ros.cli.flags import parse
+from codetr_ros.cli.terminal import console
 from codetr_ros.config import Settings, SettingsError
-from codetr_ros.processes import launcher
+from codetr_ros.processes import launcher, middleware
 from codetr_ros.processes.launcher import LaunchError
 from codetr_ros.processes.supervise import Interrupts, Silence, supervise, why_it_gave_up
-from codetr_ros.records import (
-    Commit,
-    CompositeReward,
-    EpisodeResult,
-    Metrics,
-    Record,
-    StepRewards,
-    TrueRewards,
-)
+from codetr_ros.records import Record
 from codetr_ros.runs import folder as run_folder
-from codetr_ros.runs import report
 from codetr_ros.runs import reports as node_reports
 from codetr_ros.runs.folder import RunFolderError
 from codetr_ros.runs.progress import Progress
-from codetr_ros.runs.recovery import RecoveryError
 from codetr_ros.runs.reports import NodeReport
-from codetr_ros.runs.run_summary import RunSummary
 from codetr_ros.runs.summary import Summary
-from codetr_ros.runs.summary import write as write_summary
 from codetr_ros.system.files import atomic_write
 
 DESCRIPTION = """Train on a task.
@@ -49,6 +36,24 @@ DESCRIPTION = """Train on a task.
 Starts a simulator, an evaluator, the reward model, the learner and a recorder as ROS 2 nodes in a
 namespace of their own, shows their progress, and ends with a summary, a report and a picture.
 Ctrl-C ends all of it cleanly. Every setting is a flag; --config sets their defaults."""
+
+PEER_DEADLINE = 60.0
+"""Seconds that nodes wait for each other unless the user gives others."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Topics:
+    """How the nodes of a run are started.
+
+    Attributes:
+        namespace: that of the nodes; None: one of the run's own.
+        peer_deadline: seconds that they wait for each other; 0: for ever.
+        start: starts each.
+    """
+
+    namespace: str | None = None
+    peer_deadline: float = PEER_DEADLINE
+    start: launcher.Start = launcher.start_program
 
 
 @dataclasses.dataclass
@@ -85,6 +90,27 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
             None,
         ),
         (
+            'namespace',
+            Annotated[
+                str | None,
+                tyro.conf.arg(
+                    metavar='/NAME', help='namespace of the nodes; by default /run_<id>'
+                ),
+            ],
+            None,
+        ),
+        (
+            'peer_deadline',
+            Annotated[
+                float,
+                tyro.conf.arg(
+                    metavar='S',
+                    help='seconds that nodes wait for one that is missing or silent; 0: for ever',
+                ),
+            ],
+            PEER_DEADLINE,
+        ),
+        (
             'in_process',
             Annotated[
                 bool,
@@ -108,14 +134,17 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
         if not in_process:
             for role in settings.roles:
                 launcher.executable(role)
+        if wrong := _wrong(extra):
+            return refuse(wrong)
         stamp = time.strftime('%Y%m%d-%H%M%S')
         out = Path(extra['out'] or default_out(settings, stamp))
-        run_folder.check(out)
+        if extra['out']:
+            run_folder.check(out)
         if in_process:
             tryout.here(settings)
         else:
             tryout.apart(settings, launcher.environment(settings))
-        folder = run_folder.create(out)
+        folder = run_folder.create(out) if extra['out'] else run_folder.create_next(out)
     except (
         SettingsError,
         tasks.TaskError,
@@ -126,12 +155,23 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
         return refuse(str(error))
     # A letter first: as a ROS parameter and in a namespace it must not read as a number.
     run_id = f'r{stamp.replace("-", "_")}_{secrets.token_hex(2)}'
+    topics = None if in_process else Topics(extra['namespace'], extra['peer_deadline'], start)
     command = shlex.join(['codetr', 'train', *arguments])
-    return train(settings, run_id, folder, in_process, start, command)
+    return train(settings, run_id, folder, topics, command)
+
+
+def _wrong(extra: Mapping[str, Any]) -> str | None:
+    """Why flags that are no settings cannot be used; None if they can."""
+    namespace = extra['namespace']
+    if namespace is not None and extra['in_process']:
+        return '--namespace is for nodes, and --in-process starts none: leave out one of them'
+    if namespace is not None and (wrong := middleware.wrong_namespace(namespace)):
+        return wrong
+    return middleware.wrong_seconds('--peer-deadline', extra['peer_deadline'])
 
 
 def default_out(settings: Settings, stamp: str) -> str:
-    """The output folder that is used if none is given."""
+    """The output folder that is used if none is given and none is there yet."""
     task = re.sub(r'[^A-Za-z0-9_.-]+', '_', settings.task)
     return f'runs/{task}-{settings.method}-{settings.seed}-{stamp}'
 
@@ -140,8 +180,7 @@ def train(
     settings: Settings,
     run_id: str,
     folder: Path,
-    in_process: bool,
-    start: launcher.Start = launcher.start_program,
+    topics: Topics | None = None,
     command: str | None = None,
 ) -> int:
     """Do a run and write everything about it into its folder.
@@ -150,8 +189,7 @@ def train(
         settings: the run's settings.
         run_id: its name: letters, digits and `_`.
         folder: its folder, which exists.
-        in_process: run without nodes.
-        start: starts the nodes.
+        topics: how the nodes are started; None: run in process, without any.
         command: the command line, for the summary.
 
     Returns:
@@ -161,28 +199,29 @@ def train(
         run_folder.write_settings(folder, settings)
     except OSError as error:
         return refuse(str(error))
-    summary = Summary(settings, run_id, in_process, command=command)
+    summary = Summary(settings, run_id, topics is None, command=command)
     progress = Progress(settings)
     progress.log(
         f'{settings.task}: {settings.composite} of {settings.delay} steps, method '
         f'{settings.method}, {settings.steps} steps, seed {settings.seed}'
-        + (', in process' if in_process else '')
+        + (', in process' if topics is None else '')
     )
-    progress.log(f'output: {_short(folder)}')
+    progress.log(f'output: {results.short(folder)}')
+    if topics is not None:
+        progress.log(f'namespace: {topics.namespace or launcher.namespace_of(run_id)}')
     with Interrupts() as interrupts:
         with progress:
-            way = _in_process if in_process else partial(_over_topics, start)
+            way = _in_process if topics is None else partial(_over_topics, topics)
             outcome = way(settings, run_id, folder, summary, progress, interrupts)
         bag = folder / run_folder.BAG
         built = summary.build(
             outcome.reports, bag if bag.is_dir() else None, outcome.interrupted, outcome.failure
         )
         try:
-            write_summary(folder, built, summary.metrics_csv(), summary.segments())
-            report.write(folder, built)
+            results.write(folder, summary, built)
         except OSError as error:
             outcome.failure = '; '.join(filter(None, (outcome.failure, str(error))))
-    show(built, folder, Console())
+    results.show(built, folder, console(tables=True))
     if outcome.failure:
         show_failure(outcome)
     if outcome.interrupted:
@@ -227,7 +266,7 @@ def _in_process(
 
 
 def _over_topics(
-    start: launcher.Start,
+    topics: Topics,
     settings: Settings,
     run_id: str,
     folder: Path,
@@ -235,7 +274,10 @@ def _over_topics(
     progress: Progress,
     interrupts: Interrupts,
 ) -> Outcome:
-    commands = launcher.commands(settings, run_id, folder)
+    namespace = topics.namespace or launcher.namespace_of(run_id)
+    commands = launcher.commands(
+        settings, run_id, folder, namespace=namespace, peer_deadline=topics.peer_deadline
+    )
     environment = launcher.environment(settings)
     # The watcher lives in this process and must look for the nodes where they are.
     os.environ.update(
@@ -258,10 +300,10 @@ def _over_topics(
 
     failure = None
     asked = interrupts.again
-    with launcher.Processes(progress.log, asked, start_program=start) as processes:
+    with launcher.Processes(progress.log, asked, start_program=topics.start) as processes:
         try:
             # The watcher comes first, so as to receive everything from the nodes' start on.
-            with Watcher(receive, f'/run_{run_id}') as watcher:
+            with Watcher(receive, namespace) as watcher:
 
                 def poll() -> None:
                     watcher.poll(0.1)
@@ -285,94 +327,28 @@ def _over_topics(
         reports[key] = known.model_copy(update={'exit_code': node.code})
     summary.end()
     interrupted = bool(interrupts.count)
-    _complete(summary, folder, progress, interrupts)
+    if (folder / run_folder.BAG).exists():  # else no recorder started, and the failure names it
+        progress.log('reading the bag for the summary')
+        before = interrupts.count
+        bag = folder / run_folder.BAG
+        results.complete(summary, bag, progress.log, lambda: interrupts.count > before)
     culprit = next((node.log for node in processes.nodes if node.unasked_failure), None)
     return Outcome(reports, interrupted, failure, culprit)
 
 
-def _complete(summary: Summary, folder: Path, progress: Progress, interrupts: Interrupts) -> None:
-    """Hand the records of the bag to the summary.
-
-    The bag holds the first messages of a run, for which the watcher may have come too late, and
-    true rewards and labels, to which it does not subscribe. Takes a second for each evaluation of
-    a memory of a million steps; Ctrl-C ends it.
-    """
-    from codetr_ros.bags.errors import BagError
-    from codetr_ros.bags.reader import Bag
-
-    if not (folder / run_folder.BAG).exists():
-        return  # no recorder started, and the failure names it
-    asked = interrupts.count
-    progress.log('reading the bag for the summary')
-    try:
-        bag = Bag(folder / run_folder.BAG)
-        # labels last: they may have been recorded before the true rewards of their phase
-        unlabelled = (EpisodeResult, Metrics, Commit, TrueRewards, CompositeReward)
-        for kinds in unlabelled, (StepRewards,):
-            for entry in bag.entries(kinds):
-                if interrupts.count > asked:
-                    progress.log('stopped: the summary holds what was read until now')
-                    return
-                summary.receive(entry.record)
-    except BagError as error:
-        progress.log(f'the summary holds what was received, and the bag up to a fault: {error}')
-    except RecoveryError as error:
-        progress.log(f'reward recovery is incomplete: {error}')
-
-
-def _short(path: Path) -> str:
-    """A path as people type it: relative to the current folder where it lies within."""
-    try:
-        return str(path.relative_to(Path.cwd()))
-    except ValueError:
-        return str(path)
-
-
-def show(summary: RunSummary, folder: Path, console: Console) -> None:
-    """Print the results of a run."""
-    values = [row.true_return_mean for row in summary.evaluated()]
-    known = [value for value in values if value is not None]
-    if summary.evaluations and len(known) == len(values):
-        curve = report.sketch(known, console.encoding)
-        begins = 'random policy' if summary.random else f'{summary.evaluations[0].step} steps'
-        console.print(
-            f'\ntrue return, {begins} to {summary.evaluations[-1].step} steps: '
-            f'{known[0]:.1f} |{curve}| {known[-1]:.1f}',
-            highlight=False,
-            markup=False,
-        )
-    table = Table(box=None, show_header=False, pad_edge=False)
-    table.add_column(style='dim', no_wrap=True)
-    table.add_column(overflow='fold')
-    for name, text in report.result_rows(summary):
-        table.add_row(name, text)
-    for name, file in (
-        ('report', run_folder.REPORT),
-        ('picture', run_folder.PICTURE),
-        ('summary', run_folder.SUMMARY),
-        ('metrics', run_folder.METRICS),
-    ):
-        table.add_row(name, _short(folder / file))
-    if summary.bag:
-        table.add_row('bag', _short(Path(summary.bag)))
-    console.print()
-    console.print(table)
-    if summary.interrupted:
-        console.print('\ninterrupted: what was done is kept', highlight=False)
-
-
 def show_failure(outcome: Outcome) -> None:
     """Print on stderr why the run failed, with the end of the log that explains it."""
-    console = Console(stderr=True)
-    console.print(
+    shown = console(stderr=True)
+    shown.print(
         f'\ncodetr: the run failed: {outcome.failure}',
         style='bold red',
-        markup=False,
-        soft_wrap=True,
     )
     if outcome.log is not None:
-        console.print(
-            f'the end of {_short(outcome.log)}:', markup=False, highlight=False, soft_wrap=True
+        shown.print(
+            f'the end of {results.short(outcome.log)}:',
+            markup=False,
+            highlight=False,
+            soft_wrap=True,
         )
         text = launcher.end_of_log(outcome.log)
-        console.print(text, markup=False, highlight=False, soft_wrap=True)
+        shown.print(text)

@@ -1,6 +1,7 @@
 """The folder of a run and the places in it."""
 
 import re
+from itertools import count
 from pathlib import Path
 
 import yaml
@@ -67,12 +68,41 @@ def create(path: Path) -> Path:
     folder = path.absolute()
     try:
         for name in (NODES, LOGS, CHECKPOINTS):
-            (folder / name).mkdir(parents=True, exist_ok=True)
+            (folder / name).mkdir(parents=True)
+    except FileExistsError as error:  # since it was checked
+        raise RunFolderError(
+            f'output folder {path} was made by another run just now: choose another with --out'
+        ) from error
     except OSError as error:
         raise RunFolderError(
             f'output folder {path} cannot be made ({error.strerror}): choose another with --out'
         ) from error
     return folder
+
+
+def create_next(path: Path) -> Path:
+    """Make the folder of a new run under this name or, where that is taken, under the next:
+    NAME-2, NAME-3, ... Two runs that begin in the same second have the same name.
+
+    Returns:
+        The absolute path.
+
+    Raises:
+        RunFolderError: none can be made.
+    """
+    for number in count(1):
+        folder = path if number == 1 else path.with_name(f'{path.name}-{number}')
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise RunFolderError(
+                f'output folder {folder} cannot be made ({error.strerror}): choose another with '
+                '--out'
+            ) from error
+        return create(folder)
+    raise AssertionError('there is always a next number')
 
 
 def bag_of(path: Path) -> Path:

@@ -150,9 +150,13 @@ class Summary:
         """Seconds that the run has taken, the start of its processes included."""
         return self._clock() - self._began if self._wall is None else self._wall
 
-    def end(self) -> None:
-        """End the time of the run; records may still come."""
-        self._wall = self.wall_s
+    def end(self, wall_s: float | None = None) -> None:
+        """End the time of the run; records may still come.
+
+        Args:
+            wall_s: seconds that it took; None: until now.
+        """
+        self._wall = self.wall_s if wall_s is None else wall_s
 
     def evaluations(self) -> list[Evaluation]:
         """A row for each evaluation, in order of training steps."""

@@ -7,6 +7,7 @@ machine that has lost its power, then sees the whole old file or the whole new o
 import errno
 import os
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 _REMEDIES = {
@@ -76,6 +77,12 @@ def write_synced(path: Path, data: bytes) -> None:
         raise FileError(error.errno, error.strerror, str(path)) from error
 
 
+def _remove(partial: Path) -> None:
+    """Remove what was written of a file, after an error that is worth more than another one."""
+    with suppress(OSError):
+        partial.unlink(missing_ok=True)
+
+
 def atomic_write(path: Path, data: bytes | str) -> None:
     """Write a file whole or not at all: temporary name in the same folder, fsync, rename.
 
@@ -92,9 +99,9 @@ def atomic_write(path: Path, data: bytes | str) -> None:
         write_synced(partial, content)
         os.replace(partial, path)
     except FileError as error:
-        partial.unlink(missing_ok=True)
-        raise FileError(error.errno, error.strerror, str(path)) from error
+        _remove(partial)
+        raise FileError(error.errno, error.strerror, str(path)) from None
     except BaseException:
-        partial.unlink(missing_ok=True)
+        _remove(partial)
         raise
     sync_folder(path.parent)

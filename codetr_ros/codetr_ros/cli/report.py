@@ -1,0 +1,195 @@
+"""`codetr report`: the summary, report and pictures of a run from what lies in its folder."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from codetr_ros.cli import FAILED, refuse, results
+from codetr_ros.cli.terminal import console, parse_arguments
+from codetr_ros.config import Settings, SettingsError, from_canonical
+from codetr_ros.records import RunSpec
+from codetr_ros.records.fields import type_name
+from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs import report, reports, run_summary
+from codetr_ros.runs.folder import RunFolderError
+from codetr_ros.runs.reports import NodeReport
+from codetr_ros.runs.run_summary import RunSummary
+from codetr_ros.runs.summary import Summary
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Make the summary, report and pictures of a run, and print its results.
+
+    For a run whose nodes were started by hand or by a launch file, for one that was killed, and
+    for one that still runs. Everything is taken from the bag, the nodes' reports and the settings
+    in the folder. What `codetr train` alone can know is taken from its summary, if there is one.
+    """
+
+    run_dir: Annotated[
+        Path, tyro.conf.Positional, tyro.conf.arg(metavar='FOLDER', help="the run's folder")
+    ]
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """What lies in the folder of a run.
+
+    Attributes:
+        reports: of its nodes, by `<role>-<name>`.
+        bag: its bag; None without one.
+        before: its summary, if one was made before.
+    """
+
+    reports: Mapping[str, NodeReport]
+    bag: Path | None
+    before: RunSummary | None
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Make and print it; returns the exit code."""
+    given = parse_arguments(Arguments, arguments, 'codetr report')
+    folder = given.run_dir.absolute()
+    shown = console()
+
+    def log(text: str) -> None:
+        shown.print(text)
+
+    try:
+        found = look(folder)
+        if found.bag is None:
+            built = again(folder, found)
+        else:
+            built = from_bag(folder, found, found.bag, log)
+    except (RunFolderError, SettingsError) as error:
+        return refuse(str(error))
+    except OSError as error:
+        refuse(str(error))
+        return FAILED
+    results.show(built, folder, console(tables=True))
+    if built.failure:
+        log(f'\nthe run failed: {built.failure}')
+    return 0
+
+
+def look(folder: Path) -> Found:
+    """Look what the folder of a run holds.
+
+    Raises:
+        RunFolderError: it is no such folder, or a node's report or the summary is damaged.
+    """
+    if not folder.is_dir():
+        raise RunFolderError(f'there is no folder {folder}: give the folder of a run')
+    known = reports.read_all(folder)
+    places = [folder / run_folder.BAG, *(Path(r.bag) for r in known.values() if r.bag)]
+    bag = next((place for place in places if place.exists()), None)
+    path = folder / run_folder.SUMMARY
+    return Found(known, bag, run_summary.read(path) if path.exists() else None)
+
+
+def again(folder: Path, found: Found) -> RunSummary:
+    """Write picture and report again from the summary of a run without a bag.
+
+    Raises:
+        RunFolderError: there is no summary either.
+        OSError: they cannot be written.
+    """
+    if found.before is None:
+        raise RunFolderError(
+            f'{folder} holds neither a bag nor a {run_folder.SUMMARY}, so nothing is known of a '
+            'run: give the folder of a run, to the recorder as its parameter folder too'
+        )
+    report.write(folder, found.before)
+    return found.before
+
+
+def from_bag(folder: Path, found: Found, bag: Path, log: Callable[[str], None]) -> RunSummary:
+    """Write summary, metrics, picture and report of a run from its bag.
+
+    Args:
+        folder: the run's folder.
+        found: what is in it.
+        bag: its bag.
+        log: prints a line for people.
+
+    Raises:
+        RunFolderError: the bag holds no run.
+        SettingsError: the settings of the run cannot be read.
+        OSError: a file cannot be written.
+    """
+    run_id, settings, began, seconds = _recorded(bag)
+    before = found.before
+    if before is not None and before.run_id != run_id:
+        before = None  # of another run
+    summary = Summary(settings, run_id, in_process=False)
+    summary.start = began
+    results.complete(summary, bag, log)
+    walls = [r.wall_s for r in found.reports.values() if r.wall_s is not None]
+    summary.end(before.wall_s if before else max(walls, default=seconds))
+    named = {
+        name: r.model_copy(update={'exit_code': before.processes[name].exit_code})
+        if before and name in before.processes
+        else r
+        for name, r in found.reports.items()
+    }
+    built = summary.build(
+        named,
+        bag,
+        before.interrupted if before else _interrupted(found.reports),
+        before.failure if before else _failure(found.reports),
+    )
+    built = built.model_copy(update=_kept(built, before))
+    results.write(folder, summary, built)
+    return built
+
+
+def _recorded(bag: Path) -> tuple[str, Settings, datetime, float]:
+    """The id and the settings of the run in a bag, when recording began and how many seconds it
+    took.
+    """
+    from codetr_ros.bags.errors import BagError
+    from codetr_ros.bags.reader import Bag
+
+    runs: dict[str, RunSpec] = {}
+    first = last = 0
+    try:
+        for raw in (opened := Bag(bag, lambda _: None)).raw():
+            first, last = first or raw.log_time, raw.log_time
+            entry = opened.entry(raw) if raw.channel.type == type_name(RunSpec) else None
+            if entry is not None and isinstance(entry.record, RunSpec):
+                runs[entry.record.run_id] = entry.record
+    except BagError as error:
+        raise RunFolderError(str(error)) from None
+    if len(runs) != 1:
+        there = f'{len(runs)} runs ({", ".join(runs)})' if runs else 'no run'
+        raise RunFolderError(f'{bag} holds {there}: give the folder of one run')
+    (run,) = runs.values()
+    settings = from_canonical(run.settings, f'{bag}: run {run.run_id!r}')
+    began = datetime.fromtimestamp(first / 1e9).astimezone()
+    return run.run_id, settings, began, (last - first) / 1e9
+
+
+def _kept(built: RunSummary, before: RunSummary | None) -> dict[str, object]:
+    """What only the process that has done the run could know: what it took, and its versions."""
+    own = 'codetr'
+    processes = {name: use for name, use in built.processes.items() if name != own}
+    if before is None:
+        return {'processes': processes, 'host': None}
+    taken = {own: before.processes[own]} if own in before.processes else {}
+    kept = {name: getattr(before, name) for name in ('versions', 'began', 'host', 'command')}
+    return {'processes': processes | taken, **kept}
+
+
+def _failure(reports: Mapping[str, NodeReport]) -> str | None:
+    """Why the nodes gave up; None if none did."""
+    why = [f'{report.name}: {report.error}' for report in reports.values() if report.error]
+    return '; '.join(why) or None
+
+
+def _interrupted(reports: Mapping[str, NodeReport]) -> bool:
+    """Whether nodes were asked to end before the run was over."""
+    return any(report.finished is False and not report.error for report in reports.values())
