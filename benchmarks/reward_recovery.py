@@ -20,8 +20,10 @@ the file already are not run again. Means over seeds go beside it as Markdown.
 
 import argparse
 import csv
+import dataclasses
 import math
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +33,7 @@ import machine
 from codetr_ros.config import Settings, load
 from codetr_ros.cores import in_process
 from codetr_ros.memory.trajectories import Trajectories
-from codetr_ros.records import CompositeReward, Record, Transitions, TrueRewards
+from codetr_ros.records import F64, CompositeReward, Record, Transitions, TrueRewards
 from codetr_ros.rewards import registry
 from codetr_ros.rewards.base import Predictor, segment_steps
 from codetr_ros.rewards.codetr import Codetr
@@ -116,14 +118,27 @@ def replay(cache: Path, steps: int = 20_000) -> dict[str, np.ndarray]:
         return dict(data)
 
 
-def memories(data: dict[str, np.ndarray], settings: Settings) -> tuple[Trajectories, Trajectories]:
-    """Training and held-out episodes as memories D, scored with the settings' composite reward."""
-    sizes = data['observations'].shape[1], data['actions'].shape[1]
+def memories(
+    data: dict[str, np.ndarray],
+    settings: Settings,
+    disturb: Callable[[F64], F64] | None = None,
+    most: int | None = None,
+) -> tuple[Trajectories, Trajectories]:
+    """Training and held-out episodes as memories D, scored with the settings' composite reward.
+
+    Args:
+        data: of `replay`.
+        settings: their composite reward, delay and seed count.
+        disturb: what a scorer makes of the exact scores (S,) of the training episodes.
+        most: scores of the training episodes, drawn at random; all if not given.
+    """
+    sizes, delay = (data['observations'].shape[1], data['actions'].shape[1]), settings.delay
     made = [
-        Trajectories(*sizes, DELAY, len(data['rewards']), 1000, true_rewards=True)
+        Trajectories(*sizes, delay, len(data['rewards']), 1000, true_rewards=True)
         for _ in range(2)
     ]
     counts = [0, 0]
+    scores: list[list[CompositeReward]] = [[], []]
     for episode in range(len(data['finals'])):
         rows = np.flatnonzero(data['episodes'] == episode)
         side = int(episode % 5 == 4)
@@ -160,10 +175,10 @@ def memories(data: dict[str, np.ndarray], settings: Settings) -> tuple[Trajector
                 rewards=true,
             )
         )
-        for first in range(0, n, DELAY):
-            part = true[first : first + DELAY].astype(np.float64)
-            value = composite(settings.composite, part, settings.beta, DELAY)
-            memory.score(
+        for first in range(0, n, delay):
+            part = true[first : first + delay].astype(np.float64)
+            value = composite(settings.composite, part, settings.beta, delay)
+            scores[side].append(
                 CompositeReward(
                     run_id='',
                     source='s',
@@ -175,6 +190,14 @@ def memories(data: dict[str, np.ndarray], settings: Settings) -> tuple[Trajector
                     value=value,
                 )
             )
+    values = np.array([score.value for score in scores[0]])
+    if disturb is not None:
+        values = disturb(values)
+    order = generator(settings.seed, 'recovery', 'scores').permutation(len(values))
+    for place in np.sort(order[:most]).tolist():
+        made[0].score(dataclasses.replace(scores[0][place], value=float(values[place])))
+    for score in scores[1]:
+        made[1].score(score)
     return made[0], made[1]
 
 

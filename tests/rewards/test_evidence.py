@@ -99,7 +99,9 @@ def test_the_posterior_is_that_of_brute_force_whichever_space_is_smaller(scores,
 
 def test_the_noise_is_that_of_its_formula():
     spread = torch.tensor([0.5, 2.0], dtype=torch.float64)
-    np.testing.assert_allclose(noise(THETA, spread), 0.3 * spread + 0.02 + JITTER, rtol=1e-12)
+    data = Linear(torch.zeros(2, 1), spread, spread, noise=torch.tensor([0.0, 0.7]))
+    expected = 0.3 * spread.numpy() + 0.02 + JITTER + np.array([0.0, 0.7])
+    np.testing.assert_allclose(noise(THETA, data), expected, rtol=1e-7)
 
 
 def test_learning_makes_the_evidence_larger_and_stays_within_bounds():

@@ -253,6 +253,11 @@ class EvidenceSettings(Group):
         description='how step rewards make a score: as `composite` and `beta` state, or as the '
         'scores themselves let infer',
     )
+    score_scale: Literal['numbers', 'ordinal'] = Field(
+        'numbers',
+        description='whether scores are numbers, or verdicts such as one to five stars of which '
+        'only the order means anything: their scale is then learnt too',
+    )
     scores: int = Field(
         8192,
         ge=2,

@@ -54,18 +54,19 @@ def candidates(m: I64) -> list[Link]:
     return made
 
 
-def choose(sample: Sample, some: I64, blocks: Sequence[slice]) -> Choice:
+def choose(sample: Sample, some: I64, blocks: Sequence[slice], ordinal: bool = False) -> Choice:
     """Fit each candidate to the same scores.
 
     Args:
         sample: segments, with the features of their steps.
         some: places of those from which the scales are learnt and the evidence is.
         blocks: of the features.
+        ordinal: only the order of scores means anything.
     """
     models: dict[str, Model] = {}
     for link in candidates(sample.m):
         model = Model(link, blocks)
-        model.fit(sample, some)
+        model.fit(sample, some, ordinal)
         if link.name not in models or model.evidence > models[link.name].evidence:
             models[link.name] = model
     most = max(model.evidence for model in models.values())

@@ -85,6 +85,10 @@ class Evidence(Predictor):
         return Model(link, self._features.blocks)
 
     @property
+    def _ordinal(self) -> bool:
+        return self._own.score_scale == 'ordinal'
+
+    @property
     def version(self) -> int:
         """Fits so far: phases in which there were other scores than before."""
         return self._fits
@@ -107,6 +111,8 @@ class Evidence(Predictor):
             return
         anew = len(all_ids) >= 2 * self._begun_at
         choosing = anew and self._own.link == 'choose'
+        if self._ordinal:
+            self._require_few_values(scores)
         steps = choosing or not self._model.link.linear
         ids = self._ids(memory, all_ids, steps)
         moments = self._sampler.moments(memory, ids)
@@ -134,6 +140,16 @@ class Evidence(Predictor):
         self._seen = seen
         self._fits += 1
 
+    def _require_few_values(self, scores: F64) -> None:
+        values = np.unique(scores)
+        if not 2 <= len(values) <= saving.MOST_VALUES:
+            shown = ', '.join(f'{value:g}' for value in values[:3])
+            raise RewardModelError(
+                f'evidence.score_scale = ordinal: the {len(scores)} scores have {len(values)} '
+                f'different values ({shown}, ...), an ordinal scale has 2 to '
+                f'{saving.MOST_VALUES}. Set evidence.score_scale to numbers'
+            )
+
     def _ids(self, memory: Trajectories, ids: I64, steps: bool) -> I64:
         """Segments to learn from: a bounded number, and of bounded steps if these are kept."""
         most = self._own.scores
@@ -150,15 +166,15 @@ class Evidence(Predictor):
         before = self._model
         fresh = Model(copy.copy(before.link), before.blocks)
         again = anew and before.fitted and not before.link.linear
-        before.fit(sample, some)
+        before.fit(sample, some, self._ordinal)
         if again:
             fresh.scale = before.scale
-            fresh.fit(sample, some)
+            fresh.fit(sample, some, self._ordinal)
             if fresh.evidence > before.evidence:
                 self._model = fresh
 
     def _choose(self, sample: Sample, some: I64) -> None:
-        choice = choose(sample, some, self._features.blocks)
+        choice = choose(sample, some, self._features.blocks, self._ordinal)
         self._model = choice.models[choice.best]
         self._probability = choice.probabilities[choice.best]
         self._margin = choice.margin
@@ -187,10 +203,7 @@ class Evidence(Predictor):
             RewardModelError: `prepare` was never called.
         """
         self._require_prepared()
-        f = self._f(batch)
-        m = batch.lengths - batch.context
-        level = self._model.link.forward(f, np.cumsum(m) - m, m)[0]
-        return self._model.link.score(level * self._model.scale, m)
+        return self._model.scores(self._f(batch), batch.lengths - batch.context)
 
     def uncertainty(self, batch: SegmentBatch) -> Uncertainty:
         """How far the rewards of segments' steps may be off: ask for scores where it is large.
@@ -229,6 +242,8 @@ class Evidence(Predictor):
             'link_probability': self._probability,
             'link_margin': self._margin,
         }
+        if model.verdicts is not None:
+            known['verdict_noise_sd'] = model.verdicts.tau * factor
         if isinstance(model.link, SoftMax):
             known['beta'] = model.link.beta / model.scale
         return known
@@ -237,12 +252,15 @@ class Evidence(Predictor):
         """The link, how sure it is, and what rewards depend on most, for a run's summary."""
         if not self._fits:
             return {}
-        factor = self._model.scale / self.unit
+        factor, verdicts = self._model.scale / self.unit, self._model.verdicts
         effects = self._features.effects(self._model.posterior.mean)
         most = sorted(effects, key=lambda name: -abs(effects[name]))[:SHOWN]
         return {
             **self.metrics(),
             'link': self._model.link.name,
+            **(
+                {} if verdicts is None else {'thresholds': (verdicts.thresholds * factor).tolist()}
+            ),
             'link_is': 'chosen' if self._own.link == 'choose' else 'known',
             'depends_on': ', '.join(f'{name} {effects[name] * factor:+.2g}' for name in most),
         }

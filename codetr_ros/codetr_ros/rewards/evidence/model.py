@@ -10,6 +10,7 @@ here: several annealings, and after a first fit, the scales are learnt in the fi
 import copy
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ from codetr_ros.rewards.evidence.maxima import SoftMax
 from codetr_ros.rewards.evidence.regression import Posterior, noise, posterior, prior_variances
 from codetr_ros.rewards.evidence.sample import Sample
 from codetr_ros.rewards.evidence.scales import Evidence, Linear
+from codetr_ros.rewards.evidence.verdicts import Verdicts
 
 ROUNDS = (7, 3)
 """Gauss-Newton rounds of a first fit, after its first one, and of later fits."""
@@ -31,10 +33,22 @@ HEATS: tuple[tuple[float, ...], ...] = ((0.1, 0.3), (0.3,), ())
 """A soft maximum is annealed at the first fit: its beta by such factors. Few scores may lead to a
 place that is not the best one, so there are several beginnings, of which the likeliest one stays.
 """
+FEW = 200
+"""Scores up to which a first fit has several beginnings."""
 HEAT_ROUNDS = 3
 """Rounds with each of them."""
+TURNS = (5, 2)
+"""Of learning levels and the scale of verdicts, in a first fit and in later ones."""
 STEPS = (1.0, 0.5, 0.25)
 """Step lengths of Gauss-Newton, of which the best one is taken."""
+
+
+@dataclass(frozen=True)
+class Targets:
+    """What scores state of levels, in units of the level scale."""
+
+    levels: F64  # (S,)
+    noise: Tensor | float = 0.0  # (S,) variance that each has besides
 
 
 class Model:
@@ -60,6 +74,8 @@ class Model:
         """Logarithm of the marginal likelihood of the scores from which scales are learnt."""
         self.left_out_r2 = 0.0
         """Of levels of these scores, each predicted from all others."""
+        self.verdicts: Verdicts | None = None
+        """The scale of the scores, where it is ordinal."""
 
     def measure(self, scores: F64, m: I64) -> None:
         """Freeze the unit of levels, the first time.
@@ -79,73 +95,152 @@ class Model:
             self.scale = scale
             self.link.measure(scale)
 
-    def fit(self, sample: Sample, some: I64) -> None:
+    def fit(self, sample: Sample, some: I64, ordinal: bool = False) -> None:
         """Learn from segments.
 
         Args:
             sample: the segments; with the features of steps, unless the link is linear.
             some: places of those from which the scales are learnt.
+            ordinal: only the order of scores means anything.
 
         Raises:
             FloatingPointError: numbers are too large for float64.
         """
         self.measure(sample.scores, sample.m)
-        y = self.link.level(sample.scores, sample.m) / self.scale
+        levels = self.link.level(sample.scores, sample.m) / self.scale
+        if ordinal:
+            self._fit_verdicts(sample, levels, some)
+            return
+        self._fit(sample, Targets(levels), some)
+        slopes = self.link.log_slope(sample.scores, sample.m)[some]
+        self.evidence += float(slopes.sum()) - len(some) * math.log(self.scale)
+
+    def _fit_verdicts(self, sample: Sample, levels: F64, some: I64) -> None:
+        """Fit to what verdicts state of levels, and learn their scale: in turns.
+
+        The levels keep the mean and the deviation that they have with verdicts taken for numbers:
+        else any other unit would do as well.
+        """
+        scores = sample.scores
+        known = self.verdicts
+        if known is None or not np.array_equal(known.values, np.unique(scores)):
+            verdicts, turns = Verdicts.first(scores, levels), TURNS[0]
+            mean = np.full(len(scores), levels.mean())
+        else:
+            verdicts, turns = known, TURNS[1]
+            mean = self._predicted(sample)
+        variance = np.full(len(scores), verdicts.spread)
+        for turn in range(turns):
+            targets = _sites(verdicts, scores, mean, variance)
+            self._fit(sample, targets, some)
+            mean, variance = self._left_out(sample, targets)
+            if turn < turns - 1:
+                verdicts = verdicts.learnt(scores, mean, variance)
+                expected = verdicts.expected(scores, mean, variance)[0]
+                factor = (
+                    levels.std() / (expected.std() or 1.0) if len(verdicts.values) > 1 else 1.0
+                )
+                shift = levels.mean() - factor * expected.mean()
+                verdicts = verdicts.moved(factor, shift)
+                mean, variance = mean * factor + shift, variance * factor**2
+        self.verdicts = verdicts
+        self.evidence = verdicts.log_likelihood(scores, mean, variance)
+
+    def _fit(self, sample: Sample, targets: 'Targets', some: I64) -> None:
         places = torch.tensor(some)
         if self.link.linear:
-            spread = torch.tensor(1 / sample.m)
-            data = Linear(sample.means(), spread, torch.tensor(y))
-            log_evidence, residuals = self._learn_scales(data.part(places), ITERATIONS)
+            data = self._linear(sample, targets)
+            self.evidence, residuals = self._learn_scales(data.part(places), ITERATIONS)
             self.posterior = posterior(data, self.theta, self.blocks)
         else:
-            log_evidence, residuals = self._rounds(sample, y, places)
+            self.evidence, residuals = self._rounds(sample, targets, places)
         self.fitted = True
-        slopes = self.link.log_slope(sample.scores, sample.m)[some]
-        self.evidence = log_evidence + float(slopes.sum()) - len(some) * math.log(self.scale)
-        about = y[some] - y[some].mean()
+        y = targets.levels[some]
+        about = y - y.mean()
         total = float(about @ about)
         self.left_out_r2 = 1 - float(residuals @ residuals) / total if total > 0 else 0.0
 
-    def _rounds(self, sample: Sample, y: F64, places: Tensor) -> tuple[float, Tensor]:
+    def _linear(self, sample: Sample, targets: 'Targets') -> Linear:
+        """The regression where F is the mean."""
+        levels, spread = torch.tensor(targets.levels), torch.tensor(1 / sample.m)
+        return Linear(sample.means(), spread, levels, noise=targets.noise)
+
+    def _predicted(self, sample: Sample) -> F64:
+        """Levels (S,) that the posterior mean lets expect."""
+        if self.link.linear:
+            predicted: F64 = (sample.means() @ self.posterior.mean).numpy()
+            return predicted
+        f = of_steps(sample.steps(), self.posterior.mean)
+        return self.link.forward(f, sample.starts, sample.m)[0]
+
+    def _left_out(self, sample: Sample, targets: 'Targets') -> tuple[F64, F64]:
+        """Mean and variance (S,) of each level, as predicted from all other scores."""
+        data = self._linear(sample, targets)
+        if not self.link.linear:
+            f = of_steps(sample.steps(), self.posterior.mean)
+            slopes = self.link.forward(f, sample.starts, sample.m)[1]
+            data = self._linearised(sample, slopes, targets.levels, targets.noise)
+        noises = noise(self.theta, data)
+        variances = self.posterior.variances(data.rows)
+        left = (1 - variances / noises).clamp_min_(1e-3)  # 1 - leverage
+        off = targets.levels - self._predicted(sample)
+        own = noises - data.noise  # of the level itself, which a verdict is about
+        mean: F64 = targets.levels - off / left.numpy()
+        return mean, (variances / left + own).numpy()
+
+    @staticmethod
+    def _linearised(
+        sample: Sample, slopes: F64, targets: F64, own: Tensor | float, known: F64 | None = None
+    ) -> Linear:
+        """The regression with the slopes J (N,) of F."""
+        return Linear(
+            _gathered(sample.steps(), slopes, sample.m),
+            torch.tensor(np.add.reduceat(slopes * slopes, sample.starts)),
+            torch.tensor(targets),
+            None if known is None else torch.tensor(known),
+            own,
+        )
+
+    def _rounds(self, sample: Sample, targets: 'Targets', places: Tensor) -> tuple[float, Tensor]:
         """Gauss-Newton, from where it stands, or from the best of several beginnings."""
         if self.fitted:
-            return self._further(sample, y, places, ROUNDS[1])
-        soft = isinstance(self.link, SoftMax)
+            return self._further(sample, targets, places, ROUNDS[1])
+        several = isinstance(self.link, SoftMax) and len(sample.m) <= FEW
         before, begun = (self.link, self.theta, self.posterior), []
-        for heats in HEATS if soft else HEATS[-1:]:
+        for heats in HEATS if several else HEATS[:1]:
             self.fitted = False
             self.link, self.theta, self.posterior = copy.copy(before[0]), *before[1:]
-            result = self._begin(sample, y, places, heats)
+            result = self._begin(sample, targets, places, heats)
             begun.append((result, (self.link, self.theta, self.posterior)))
         result, after = max(begun, key=lambda one: one[0][0])
         self.link, self.theta, self.posterior = after
         return result
 
     def _begin(
-        self, sample: Sample, y: F64, places: Tensor, heats: Sequence[float]
+        self, sample: Sample, targets: 'Targets', places: Tensor, heats: Sequence[float]
     ) -> tuple[float, Tensor]:
         """A first fit: at first as if the score were a mean, then annealed."""
-        self._round(sample, y, places, first=True)
+        self._round(sample, targets, places, first=True)
         self.fitted = True
         if isinstance(self.link, SoftMax):
             for self.link.heat in heats:
                 for _ in range(HEAT_ROUNDS):
-                    self._round(sample, y, places)
+                    self._round(sample, targets, places)
             self.link.heat = 1.0
-        return self._further(sample, y, places, ROUNDS[0], learn=True)
+        return self._further(sample, targets, places, ROUNDS[0], learn=True)
 
     def _further(
-        self, sample: Sample, y: F64, places: Tensor, rounds: int, learn: bool = False
+        self, sample: Sample, targets: 'Targets', places: Tensor, rounds: int, learn: bool = False
     ) -> tuple[float, Tensor]:
         """Some rounds, in the first of which the scales are learnt, or in all of them."""
         for number in range(rounds - 1):
-            self._round(sample, y, places, learn=learn or number == 0)
-        return self._round(sample, y, places, learn=learn or rounds == 1, last=True)
+            self._round(sample, targets, places, learn=learn or number == 0)
+        return self._round(sample, targets, places, learn=learn or rounds == 1, last=True)
 
     def _round(
         self,
         sample: Sample,
-        y: F64,
+        targets: 'Targets',
         places: Tensor,
         first: bool = False,
         learn: bool = True,
@@ -157,29 +252,24 @@ class Model:
         """
         link, m, starts = self.link, sample.m, sample.starts
         if first:
-            data = Linear(sample.means(), torch.tensor(1 / m), torch.tensor(y))
+            data = self._linear(sample, targets)
             result = self._learn_scales(data.part(places), ITERATIONS[:1])
             self.posterior = posterior(data, self.theta, self.blocks, spread=False)
             return result
         f = of_steps(sample.steps(), self.posterior.mean)
         level, slopes = link.forward(f, starts, m)
-        targets = y - level + np.add.reduceat(slopes * f, starts)
+        z = targets.levels - level + np.add.reduceat(slopes * f, starts)
         learnt = isinstance(link, SoftMax) and link.learnt and link.heat == 1.0
         column = None
         if learnt:
             assert isinstance(link, SoftMax)
             column = link.beta_slope(f, starts, m)
-            targets = targets + column * link.log_ratio
-        data = Linear(
-            _gathered(sample.steps(), slopes, m),
-            torch.tensor(np.add.reduceat(slopes * slopes, starts)),
-            torch.tensor(targets),
-            None if column is None else torch.tensor(column),
-        )
+            z = z + column * link.log_ratio
+        data = self._linearised(sample, slopes, z, targets.noise, column)
         result = self._learn_scales(data.part(places), ITERATIONS if learn else (0, 0))
         new = posterior(data, self.theta, self.blocks, spread=last)
-        noises = noise(self.theta, data.spread).numpy()
-        self._step(sample, y, f, new, noises, learnt)
+        noises = noise(self.theta, data).numpy()
+        self._step(sample, targets.levels, f, new, noises, learnt)
         return result
 
     def _step(
@@ -227,8 +317,25 @@ class Model:
             scores: (S,) of the segments.
             m: (S,) their steps.
         """
-        level = self.link.level(scores, m) / self.scale
-        return f + np.repeat(self.link.shift(f, level, np.cumsum(m) - m, m), m)
+        starts = np.cumsum(m) - m
+        if self.verdicts is None:
+            level = self.link.level(scores, m) / self.scale
+        else:
+            mean = self.link.forward(f, starts, m)[0]
+            level = self.verdicts.expected(scores, mean, self.verdicts.spread)[0]
+        return f + np.repeat(self.link.shift(f, level, starts, m), m)
+
+    def scores(self, f: F64, m: I64) -> F64:
+        """The scores (S,) that step rewards f (N,) let expect, in the task's unit."""
+        level = self.link.forward(f, np.cumsum(m) - m, m)[0]
+        if self.verdicts is None:
+            return self.link.score(level * self.scale, m)
+        return self.verdicts.mean_value(level)
+
+
+def _sites(verdicts: Verdicts, scores: F64, mean: F64, variance: F64) -> Targets:
+    levels, left = verdicts.sites(scores, mean, variance)
+    return Targets(levels, torch.tensor(left))
 
 
 def of_steps(steps: Tensor, weights: Tensor) -> F64:

@@ -32,9 +32,12 @@ def prior_variances(theta: F64, blocks: Sequence[slice]) -> Tensor:
     return torch.tensor(np.repeat(np.exp(theta[:-2]), sizes))
 
 
-def noise(theta: F64, spread: Tensor) -> Tensor:
-    """Variance (S,) of each score's level given the weights: v_r sum J_t^2 + v_0 + 1e-8."""
-    return float(np.exp(theta[-2])) * spread + float(np.exp(theta[-1])) + JITTER
+def noise(theta: F64, data: Linear) -> Tensor:
+    """Variance (S,) of each score's level given the weights: v_r sum J_t^2 + v_0 + 1e-8, and what
+    the score has besides.
+    """
+    own = float(np.exp(theta[-2])) * data.spread + float(np.exp(theta[-1])) + JITTER
+    return own + data.noise
 
 
 def posterior(data: Linear, theta: F64, blocks: Sequence[slice], spread: bool = True) -> Posterior:
@@ -50,7 +53,7 @@ def posterior(data: Linear, theta: F64, blocks: Sequence[slice], spread: bool = 
     if data.known is not None:
         rows = torch.cat([rows, data.known[:, None]], 1)
         variances = torch.cat([variances, torch.ones(1, dtype=torch.float64)])
-    noises = noise(theta, data.spread)
+    noises = noise(theta, data)
     root = variances.sqrt()
     half = rows * root  # P Lam^1/2
     if len(rows) <= rows.shape[1]:

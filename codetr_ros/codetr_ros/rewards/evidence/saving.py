@@ -10,6 +10,10 @@ from codetr_ros.rewards.evidence import links
 from codetr_ros.rewards.evidence.maxima import SoftMax
 from codetr_ros.rewards.evidence.model import Model
 from codetr_ros.rewards.evidence.regression import Posterior
+from codetr_ros.rewards.evidence.verdicts import Verdicts
+
+MOST_VALUES = 32
+"""Of an ordinal scale."""
 
 
 def saved(model: Model) -> dict[str, Tensor]:
@@ -21,13 +25,25 @@ def saved(model: Model) -> dict[str, Tensor]:
         'left_out_r2': model.left_out_r2,
         'beta_first': soft.first if soft else 0.0,
         'beta_log_ratio': soft.log_ratio if soft else 0.0,
+        'verdict_noise': 0.0,
+        'verdict_spread': 0.0,
     }
     counts = {
         'link': links.NAMES.index(model.link.name),
         'beta_learnt': int(soft is not None and soft.learnt),
         'fitted': int(model.fitted),
+        'verdict_values': 0,
     }
+    verdicts = model.verdicts
+    scale = torch.zeros(2, MOST_VALUES, dtype=torch.float64)
+    if verdicts is not None:
+        count = len(verdicts.values)
+        counts['verdict_values'] = count
+        numbers['verdict_noise'], numbers['verdict_spread'] = verdicts.tau, verdicts.spread
+        scale[0, :count] = torch.tensor(verdicts.values)
+        scale[1, : count - 1] = torch.tensor(verdicts.thresholds)
     return {
+        'verdict_scale': scale,
         **{name: torch.tensor(n, dtype=torch.float64) for name, n in numbers.items()},
         **{name: torch.tensor(n, dtype=torch.int64) for name, n in counts.items()},
         'theta': torch.tensor(model.theta),
@@ -48,7 +64,7 @@ def restored(
         delay: as for `links.make`.
 
     Raises:
-        ValueError: it names a link that there is none of.
+        ValueError: it names a link that there is none of, or an ordinal scale of no such size.
     """
     number = int(state['link'])
     if not 0 <= number < len(links.NAMES):
@@ -66,6 +82,17 @@ def restored(
     model.evidence = float(state['evidence'])
     model.left_out_r2 = float(state['left_out_r2'])
     model.fitted = bool(state['fitted'])
+    count = int(state['verdict_values'])
+    if not 0 <= count <= MOST_VALUES:
+        raise ValueError(f'verdict_values = {count}: an ordinal scale has 2 to {MOST_VALUES}')
+    if count:
+        values, thresholds = state['verdict_scale'].numpy()
+        model.verdicts = Verdicts(
+            values[:count].copy(),
+            thresholds[: count - 1].copy(),
+            float(state['verdict_noise']),
+            float(state['verdict_spread']),
+        )
     model.theta = np.array(state['theta'].numpy())
     model.posterior = Posterior(state['weights'].clone(), state['covariance'].clone())
     return model

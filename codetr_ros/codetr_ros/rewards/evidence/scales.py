@@ -83,11 +83,13 @@ class Linear:
     spread: Tensor  # (S,) sum of J_t^2: by it the noise of steps enters
     targets: Tensor  # (S,) z, in units of the level scale
     known: Tensor | None = None  # (S,) a further row entry, whose weight has prior variance 1
+    noise: Tensor | float = 0.0  # (S,) variance that each score has besides
 
     def part(self, places: Tensor) -> 'Linear':
         """Some of the scores."""
         known = None if self.known is None else self.known[places]
-        return Linear(self.rows[places], self.spread[places], self.targets[places], known)
+        noise = self.noise[places] if isinstance(self.noise, Tensor) else self.noise
+        return Linear(self.rows[places], self.spread[places], self.targets[places], known, noise)
 
 
 class Evidence:
@@ -114,6 +116,7 @@ class Evidence:
             if wide
             else torch.zeros(0, len(data.rows) ** 2, dtype=torch.float64)
         )
+        self._noise = data.noise + JITTER
         self._fixed = None if data.known is None else torch.outer(data.known, data.known)
         self._centre = centre(len(blocks))
 
@@ -125,7 +128,7 @@ class Evidence:
         kernel = kernel.view(size, size) + narrow @ self._single.T
         if self._fixed is not None:
             kernel = kernel + self._fixed
-        kernel.diagonal().add_(float(scales[-2]) * self._spread + float(scales[-1]) + JITTER)
+        kernel.diagonal().add_(float(scales[-2]) * self._spread + float(scales[-1]) + self._noise)
         return cholesky(kernel)
 
     def __call__(self, theta: F64) -> tuple[float, F64]:

@@ -1,0 +1,161 @@
+"""Scores on an ordinal scale, such as one to five stars: only their order means anything.
+
+The formulas: docs/methods.md#evidence.
+
+A verdict states between which two thresholds the level of a segment lies, with noise of its own:
+P(verdict <= k) = Phi((b_k - L) / tau), the ordinal probit model. Thresholds b and tau are those
+under which the verdicts are likeliest, each level as predicted from all other verdicts. What a
+verdict then contributes to the regression is a level and a variance of it (a site of expectation
+propagation; Minka, 2001; Chu and Ghahramani, 2005). All of this is decided here; the trial took
+verdicts for numbers.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import log_ndtr, ndtr, ndtri
+
+from codetr_ros.records import F64
+
+LEAST_NOISE, MOST_NOISE = 0.03, 10.0
+"""Bounds of tau, in units of the deviation of levels."""
+PRIOR_NOISE = 0.3
+"""Where the prior of tau is centred; its logarithm has variance 1."""
+FAR = 30.0
+"""Deviations from the mean at which a normal distribution ends."""
+
+
+@dataclass(frozen=True)
+class Verdicts:
+    """An ordinal scale of K verdicts, in units of the level scale."""
+
+    values: F64  # (K,) the scores that were given, ascending
+    thresholds: F64  # (K - 1,) ascending
+    tau: float
+    spread: float
+    """Variance of a level about its prediction from other verdicts, on average."""
+
+    @classmethod
+    def first(cls, scores: F64, levels: F64) -> 'Verdicts':
+        """As if levels were normal: thresholds by how often each verdict was given.
+
+        Args:
+            scores: (S,) verdicts.
+            levels: (S,) taken for numbers, whose mean and deviation stay those of levels.
+        """
+        values, counts = np.unique(scores, return_counts=True)
+        shares = np.cumsum(counts)[:-1] / len(scores)
+        deviation = float(levels.std()) or 1.0
+        thresholds = float(levels.mean()) + deviation * ndtri(shares)
+        return cls(values, thresholds, PRIOR_NOISE * deviation, deviation**2)
+
+    def of(self, scores: F64) -> tuple[F64, F64]:
+        """The thresholds (S,) below and above each verdict; of a new one, by its order."""
+        low = np.concatenate([[-np.inf], self.thresholds])
+        high = np.concatenate([self.thresholds, [np.inf]])
+        places = np.clip(np.searchsorted(self.values, scores), 0, len(self.values) - 1)
+        return low[places], high[places]
+
+    def expected(self, scores: F64, mean: F64, variance: F64 | float) -> tuple[F64, F64]:
+        """Mean and variance (S,) of levels given their verdicts.
+
+        Args:
+            scores: (S,) verdicts.
+            mean: (S,) of the levels before their verdicts are known.
+            variance: (S,) of the same, or one for all.
+        """
+        low, high = self.of(scores)
+        total = np.sqrt(variance + self.tau**2)
+        below, above = ((b - mean) / total for b in (low, high))
+        mass = _log_mass(below, above)
+        up, down = (np.exp(_log_density(z) - mass) for z in (below, above))
+        slope = (up - down) / total
+        finite = [np.where(np.isfinite(z), z, 0.0) for z in (below, above)]
+        bend = slope**2 - (finite[0] * up - finite[1] * down) / total**2
+        bend = np.clip(bend, 1e-9 / total**2, 1 / total**2)
+        return mean + variance * slope, np.maximum(variance - variance**2 * bend, 1e-12)
+
+    def sites(self, scores: F64, mean: F64, variance: F64) -> tuple[F64, F64]:
+        """The levels (S,) and their variances (S,) that stand for the verdicts in a regression.
+
+        Args:
+            scores: (S,) verdicts.
+            mean: (S,) of the levels, each predicted from all other verdicts.
+            variance: (S,) of the same.
+        """
+        after, left = self.expected(scores, mean, variance)
+        precision = np.maximum(1 / left - 1 / variance, 1e-6 / variance)
+        return (after / left - mean / variance) / precision, 1 / precision
+
+    def learnt(self, scores: F64, mean: F64, variance: F64) -> 'Verdicts':
+        """The scale under which verdicts are likeliest.
+
+        Args:
+            scores: (S,) verdicts; of each value there is one at least.
+            mean: (S,) of the levels, each predicted from all other verdicts.
+            variance: (S,) of the same.
+        """
+        from scipy.optimize import minimize  # takes a second to import
+
+        unit = np.sqrt(self.spread) or 1.0
+        places = np.searchsorted(self.values, scores)
+
+        def scale(x: F64) -> tuple[F64, float]:
+            steps = np.exp(np.clip(x[1:-1], -12, 4)) * unit
+            thresholds = x[0] * unit + np.concatenate([[0.0], np.cumsum(steps)])
+            return thresholds, float(np.clip(np.exp(x[-1]), LEAST_NOISE, MOST_NOISE)) * unit
+
+        def loss(x: F64) -> float:
+            thresholds, tau = scale(x)
+            low = np.concatenate([[-np.inf], thresholds])[places]
+            high = np.concatenate([thresholds, [np.inf]])[places]
+            total = np.sqrt(variance + tau**2)
+            mass = _log_mass((low - mean) / total, (high - mean) / total)
+            return -float(mass.sum()) + 0.5 * float((x[-1] - np.log(PRIOR_NOISE)) ** 2)
+
+        steps = np.log(np.maximum(np.diff(self.thresholds), 1e-4 * unit) / unit)
+        begin = np.concatenate([[self.thresholds[0] / unit], steps, [np.log(self.tau / unit)]])
+        best = minimize(loss, begin, method='L-BFGS-B', options={'maxiter': 30})
+        thresholds, tau = scale(np.asarray(best.x, np.float64))
+        return Verdicts(self.values, thresholds, tau, float(variance.mean()))
+
+    def log_likelihood(self, scores: F64, mean: F64, variance: F64) -> float:
+        """Of verdicts (S,), their levels distributed as stated."""
+        total = np.sqrt(variance + self.tau**2)
+        below, above = ((b - mean) / total for b in self.of(scores))
+        return float(_log_mass(below, above).sum())
+
+    def mean_value(self, level: F64) -> F64:
+        """The mean verdict (S,), as a number, on segments of predicted levels (S,)."""
+        total = np.sqrt(self.spread + self.tau**2)
+        below = ndtr((self.thresholds - level[:, None]) / total)  # (S, K - 1)
+        ends = np.concatenate([np.zeros((len(level), 1)), below, np.ones((len(level), 1))], 1)
+        mean: F64 = np.diff(ends) @ self.values
+        return mean
+
+    def moved(self, factor: float, shift: float) -> 'Verdicts':
+        """The same scale in other units: each level times `factor`, plus `shift`."""
+        return Verdicts(
+            self.values,
+            self.thresholds * factor + shift,
+            self.tau * factor,
+            self.spread * factor**2,
+        )
+
+
+def _log_density(z: F64) -> F64:
+    """Of the standard normal distribution."""
+    density: F64 = -0.5 * np.clip(z, -FAR, FAR) ** 2 - 0.5 * np.log(2 * np.pi)
+    return np.where(np.isfinite(z), density, -np.inf)
+
+
+def _log_mass(low: F64, high: F64) -> F64:
+    """log(Phi(high) - Phi(low)), exact in the tails too."""
+    low, high = np.clip(low, -FAR, FAR), np.clip(high, -FAR, FAR)
+    # of two tails the lower one is exact
+    flip = low > 0
+    low, high = np.where(flip, -high, low), np.where(flip, -low, high)
+    upper = log_ndtr(high)
+    ratio = np.minimum(log_ndtr(low) - upper, -1e-12)
+    mass: F64 = upper + np.log1p(-np.exp(ratio))
+    return mass
