@@ -77,14 +77,14 @@ class Player:
 def ours(name: str) -> Player:
     """This project's own steps."""
     environment = tasks.make(name)
-    episode = EpisodeRunner(environment, Settings(task=name))
+    episode = EpisodeRunner(environment, Settings(task=name), 'sim')
 
     def play(actions: list[F32]) -> None:
         step = episode.step
         for action in actions:
             step(action)
 
-    return Player(episode.reset, list, play, lambda: episode.observation)
+    return Player(lambda seed: episode.reset(seed, 0), list, play, lambda: episode.observation)
 
 
 def floor(name: str) -> Player:
@@ -132,10 +132,10 @@ def scaled(box: Any, actions: F32) -> list[F32]:
 def episodes(name: str, steps: int) -> Iterator[tuple[int, F32]]:
     """Seeds and actions of episodes under the random policy, with this many steps together."""
     environment = tasks.make(name)
-    episode = EpisodeRunner(environment, Settings(task=name))
+    episode = EpisodeRunner(environment, Settings(task=name), 'sim')
     seed = 0
     while steps > 0:
-        episode.reset(seed)
+        episode.reset(seed, 0)
         most = min(steps, environment.horizon)
         actions = uniform_actions(generator(0, name, seed), most, environment.action_size)
         while episode.length < most and not episode.over:

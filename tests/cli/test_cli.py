@@ -104,7 +104,7 @@ def test_help_shows_the_defaults_and_ranges_of_the_chosen_config(
 @pytest.mark.parametrize(
     ('arguments', 'said'),
     [
-        ('--delay 0', 'delay = 0: Input should be greater than or equal to 1'),
+        ('--delay 0', 'delay = 0: a segment has 1 to 100000 steps'),
         ('--steps -5', 'steps = -5: Input should be greater than or equal to 1'),
         ('--codetr.heads 3', 'embedding=64 is not divisible by heads=3'),
         ('--config slow', "config 'slow' is neither a preset (quick, cpu, paper) nor a file"),

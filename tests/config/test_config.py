@@ -47,7 +47,7 @@ def test_the_papers_table_is_what_the_paper_preset_says() -> None:
 @pytest.mark.parametrize(
     ('name', 'value', 'said'),
     [
-        ('delay', 0, 'delay = 0: Input should be greater than or equal to 1'),
+        ('delay', 0, 'delay = 0: a segment has 1 to 100000 steps'),
         ('steps', -5, 'steps = -5: Input should be greater than or equal to 1'),
         ('method', 'magic', "method = 'magic': Input should be 'codetr', 'none', 'rbt', 'rrd'"),
         ('composite', 'mean', "composite = 'mean': Input should be 'sum'"),

@@ -16,7 +16,7 @@ REFUSED = {
     ),
     'a delay of 0': (
         ['--delay', '0'],
-        'delay = 0: Input should be greater than or equal to 1',
+        'delay = 0: a segment has 1 to 100000 steps',
     ),
     'a delay beyond the horizon': (
         ['--task', 'Reacher-v5', '--delay', '51'],

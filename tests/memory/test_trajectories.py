@@ -3,7 +3,11 @@
 import numpy as np
 import pytest
 
+from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import RecordError
+from helpers import builders
+from helpers.builders import ACTION as A
+from helpers.builders import OBSERVATION as O
 from helpers.memories import DELAY, Naive, filled, labels, memory, score
 
 
@@ -245,3 +249,41 @@ def test_steps_whose_first_observation_is_another_are_refused():
     chunk.observations[0] += 1
     with pytest.raises(RecordError, match='the first observation is not the one'):
         m.append(chunk)
+
+
+# ------------------------------------------------------------------------------------------------
+# segments that may lie anywhere
+
+
+def scattered(*spans):
+    """An episode of 30 steps with scored segments at (first step, length)."""
+    m = Trajectories(O, A, 10, 100, 10, regular=False)
+    m.append(builders.transitions(steps=30, truncated=True))
+    for number, (first, length) in enumerate(spans):
+        m.score(builders.score(sequence=number, first_step=first, length=length))
+    return m
+
+
+@pytest.mark.parametrize('span', [(4, 2), (0, 5), (3, 10), (1, 9), (12, 3), (2, 10), (14, 10)])
+def test_a_score_of_steps_that_another_one_covers_is_refused(span):
+    m = scattered((3, 4), (10, 5))
+    meets = any(a < span[0] + span[1] and span[0] < a + n for a, n in ((3, 4), (10, 5)))
+    assert meets
+    with pytest.raises(RecordError, match='another score covers some of these|has its composite'):
+        m.score(builders.score(first_step=span[0], length=span[1]))
+    assert len(m.segments.ids()) == 2
+
+
+@pytest.mark.parametrize('span', [(0, 3), (7, 3), (15, 10), (8, 1), (29, 1)])
+def test_a_score_of_steps_that_none_covers_is_taken(span):
+    m = scattered((3, 4), (10, 5))
+    m.score(builders.score(first_step=span[0], length=span[1]))
+    assert len(m.segments.ids()) == 3
+
+
+def test_a_run_has_the_segments_that_end_where_the_next_begins():
+    m = scattered((0, 2), (2, 5), (7, 1), (10, 4), (14, 3))
+    ids = m.segments.ids()
+    runs = [run.tolist() for run in m.segments.runs(ids, 3)]
+    assert runs == [[0], [0, 1], [0, 1, 2], [3], [3, 4]]
+    assert [run.tolist() for run in m.segments.runs(ids[2:3], 2)] == [[1, 2]]

@@ -161,7 +161,7 @@ def test_a_bag_that_does_not_say_how_its_run_learnt_is_refused(a_run, tmp_path, 
     ('flags', 'said'),
     [
         (['--config', 'cpu'], "--schedule phases learns under the run's own settings"),
-        (['--delay', '0'], 'delay = 0: Input should be greater than or equal to 1'),
+        (['--delay', '0'], 'delay = 0: a segment has 1 to 100000 steps'),
         (['--patience', '0'], 'patience = 0: Input should be greater than or equal to 1'),
     ],
 )

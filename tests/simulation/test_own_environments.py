@@ -81,8 +81,8 @@ def test_what_is_wrapped_around_an_environment_is_part_of_it(way, seed):
     entry_point, wrappers = WRAPPED[way]
     with registered(entry_point, wrappers=wrappers) as name:
         theirs = entire_episode(gymnasium.make(name), seed)
-        episode = EpisodeRunner(make(name), tiny(task=name))
-        episode.reset(seed)
+        episode = EpisodeRunner(make(name), tiny(task=name), 'sim')
+        episode.reset(seed, 0)
         observations, rewards = [episode.observation], []
         while not episode.over:
             reward, _ = episode.step(np.full(1, _action(len(rewards)), np.float32))
@@ -276,8 +276,8 @@ def test_an_environment_that_cuts_its_episodes_off_is_followed():
 def test_an_episode_that_is_cut_off_in_a_terminal_state_is_terminated_only():
     of_type = type('Both', (Point,), {'ends': lambda self: (self.t == 3, self.t == 3)})
     with registered(of_type) as name:
-        episode = EpisodeRunner(make(name), tiny(task=name))
-        episode.reset(0)
+        episode = EpisodeRunner(make(name), tiny(task=name), 'sim')
+        episode.reset(0, 0)
         while not episode.over:
             episode.step(np.zeros(1, np.float32))
     assert (episode.length, episode.terminated, episode.truncated) == (3, True, False)

@@ -6,11 +6,13 @@ Memory: twelve bytes for each episode, and whatever still waits for its counterp
 from array import array
 from collections import OrderedDict
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from codetr_ros.bags.findings import Findings
+from codetr_ros.config import Lengths, delay_in_words
 from codetr_ros.records import (
     CompositeReward,
     RecordError,
@@ -22,11 +24,50 @@ from codetr_ros.records import (
 from codetr_ros.records.checks import check_transitions
 
 _MOST_SKIPPED = 1_000_000  # episodes
+_MOST_STEPS = 10_000_000  # of an episode
 _MOST_EARLY = 10_000  # scores
 _MOST_AHEAD = 10_000  # chunks kept for their true rewards while none have come yet
 _U32 = 2**32 - 1
 Span = tuple[int, int, int]
 """Episode, first step, length."""
+
+
+@dataclass(frozen=True)
+class Cuts:
+    """Where a run's settings cut episodes into segments."""
+
+    delay: int | str
+    seed: int
+
+    def segments(
+        self, source: str, episode: int, before: int, after: int, ended: bool
+    ) -> Iterator[tuple[int, int]]:
+        """First step and length of each segment of an episode that ends with some of its steps.
+
+        Args:
+            source: whose episode it is.
+            episode: its number.
+            before: steps of it before those.
+            after: steps of it with those.
+            ended: whether it has ended with them, so that the last segment may be shorter.
+        """
+        lengths = Lengths.of(self.delay)
+        first = begin = 0
+        if lengths.drawn:
+            if after > _MOST_STEPS:
+                return  # as for wild episode numbers
+        elif lengths.most:  # what is missing, however long, is passed over
+            first = begin = before // lengths.most * lengths.most
+        ends = lengths.ends(self.seed, source, episode, after - begin)
+        for end in (ends + begin).tolist():
+            if end > before:
+                yield first, end - first
+            first = end
+        if ended and first < after:
+            yield first, after - first
+
+    def __str__(self) -> str:
+        return delay_in_words(self.delay)
 
 
 class Numbers:
@@ -64,13 +105,13 @@ class SourceChecks:
 
     Args:
         name: its name.
-        delay: steps of a segment; None where the bag has no settings.
+        cuts: where the run's settings cut episodes; None where the bag has no settings.
         findings: where faults are added.
     """
 
-    def __init__(self, name: str, delay: int | None, findings: Findings) -> None:
+    def __init__(self, name: str, cuts: Cuts | None, findings: Findings) -> None:
         self.name = name
-        self.delay = delay
+        self.cuts = cuts
         self.spec: TaskSpec | None = None
         self.numbers = Numbers(f'transitions of {name!r}', findings)
         self.committed = -1  # last sequence number that a commit has named
@@ -156,14 +197,11 @@ class SourceChecks:
         self._lengths[episode] = max(before, min(after, _U32))
         ended = chunk.terminated or chunk.truncated
         self._ended[episode] |= ended
-        if self.delay is None:
+        if self.cuts is None:
             return
-        first = max(before, chunk.first_step) // self.delay * self.delay  # not what is missing
-        while first < after:
-            length = min(self.delay, after - first)
-            if length == self.delay or ended:
-                self._due[episode, first, length] = chunk.sequence, place
-            first += self.delay
+        before = max(before, chunk.first_step)  # not what is missing
+        for first, length in self.cuts.segments(self.name, episode, before, after, ended):
+            self._due[episode, first, length] = chunk.sequence, place
 
     def score(self, reward: CompositeReward, place: Any) -> None:
         """Check that a score is that of a segment that has none yet."""
@@ -175,14 +213,14 @@ class SourceChecks:
                 self._homeless(reward, place)
             return
         self.scored += reward.length
-        if self.delay is not None:
+        if self.cuts is not None:
             span = episode, reward.first_step, reward.length
             if self._due.pop(span, None) is None:
                 self._findings.add(
                     'segment',
                     place,
-                    f'{describe(reward)} scores what is no segment of {self.delay} steps, or has '
-                    'its score already',
+                    f'{describe(reward)} scores what is no segment of {self.cuts}, or has its '
+                    'score already',
                 )
         elif reward.first_step < self._until[episode]:
             self._findings.add(

@@ -9,9 +9,10 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 
-from codetr_ros.bags.episodes import Numbers, SourceChecks
+from codetr_ros.bags.episodes import Cuts, Numbers, SourceChecks
 from codetr_ros.bags.findings import Findings
 from codetr_ros.bags.reader import Entry
+from codetr_ros.config import Lengths
 from codetr_ros.records import (
     PROTOCOL_VERSION,
     Commit,
@@ -50,7 +51,7 @@ class RunChecks:
         self._scorers: dict[str, Numbers] = {}
         self._findings = findings
         self._run: RunSpec | None = None
-        self._delay: int | None = None
+        self._cuts: Cuts | None = None
         self._permitted = 0
         self._parts: tuple[int, int, int] | None = None  # phase, next part, parts
         self._take: dict[type, Callable[[Any, Any], None]] = {
@@ -88,7 +89,7 @@ class RunChecks:
 
     def _source(self, record: Any) -> SourceChecks:
         if record.source not in self.sources:
-            self.sources[record.source] = SourceChecks(record.source, self._delay, self._findings)
+            self.sources[record.source] = SourceChecks(record.source, self._cuts, self._findings)
         return self.sources[record.source]
 
     def _add(self, kind: str, place: Any, text: str) -> None:
@@ -110,13 +111,12 @@ class RunChecks:
             )
         try:
             delay = json.loads(record.settings)['delay']
-            if type(delay) is not int or delay < 1:
-                raise ValueError(f'delay is {delay!r}')
-            self._delay = delay
+            Lengths.of(delay)  # refuses what is no delay
+            self._cuts = Cuts(delay, record.seed)
         except (ValueError, LookupError, TypeError) as error:
             self._add('run', place, f'settings cannot be read: {error}')
         for source in self.sources.values():
-            source.delay = self._delay
+            source.cuts = self._cuts
 
     def _task(self, record: TaskSpec, place: Any) -> None:
         source = self._source(record)
@@ -243,7 +243,7 @@ class RunChecks:
                     f'{self.name}: the last {source.tail} transitions of {source.name!r} are of a '
                     'phase that was not committed'
                 )
-            if self._delay is None and source.steps > source.scored:
+            if self._cuts is None and source.steps > source.scored:
                 self._findings.remarks.append(
                     f'{self.name}: {source.steps - source.scored} of {source.steps} steps of '
                     f'{source.name!r} are in no scored segment'

@@ -12,6 +12,7 @@ import numpy as np
 
 from codetr_ros.benchmark.folder import read_json
 from codetr_ros.benchmark.results import Result
+from codetr_ros.config import Lengths
 from codetr_ros.policy.acting import uniform_actions
 from codetr_ros.records import F32, F64
 from codetr_ros.seeding import generator, seed_global
@@ -25,7 +26,7 @@ SEED = 0
 """Seed of the start states and the random actions: those of the evaluations of seed 0."""
 _NUMBERS = ('score_mean', 'score_std', 'true_return_mean', 'true_return_std', 'length_mean')
 
-Anchors = dict[tuple[str, str, int], dict[str, dict[str, float]]]
+Anchors = dict[tuple[str, str, int | str], dict[str, dict[str, float]]]
 """The numbers of 'random' and 'zero', by task, composite reward and delay."""
 
 
@@ -99,19 +100,22 @@ def _episodes(environment: Environment, episodes: int, actions: Callable[[int], 
 
 
 def _numbers(
-    episodes: Sequence[F64], name: str, delay: int, horizon: int, parameters: dict[str, Any]
+    episodes: Sequence[F64],
+    name: str,
+    delay: int | str,
+    horizon: int,
+    parameters: dict[str, Any],
 ) -> dict[str, float]:
     """The numbers of an evaluation, whose segments cover an episode; the last may be shorter."""
-    beta = parameters['beta']
-    perfect = perfect_score(name, beta, delay, horizon, parameters['r_max'])
-    scores = [
-        sum(
-            composite(name, rewards[i : i + delay], beta, delay)
-            for i in range(0, len(rewards), delay)
-        )
-        / perfect
-        for rewards in episodes
-    ]
+    beta, cut = parameters['beta'], Lengths.of(delay)
+    longest = cut.most or horizon
+    shortest = cut.least if cut.drawn else longest
+    perfect = perfect_score(name, beta, longest, horizon, parameters['r_max'], shortest)
+    scores = []
+    for number, rewards in enumerate(episodes):
+        ends = cut.ends(SEED, 'evaluate', number, len(rewards) - 1)  # a last step is left over
+        segments = np.split(rewards, ends)
+        scores.append(sum(composite(name, part, beta, longest) for part in segments) / perfect)
     returns = [float(rewards.sum()) for rewards in episodes]
     values = np.mean(scores), np.std(scores), np.mean(returns), np.std(returns)
     lengths = np.mean([len(rewards) for rewards in episodes])

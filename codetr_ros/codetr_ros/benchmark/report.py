@@ -10,6 +10,7 @@ from codetr_ros.benchmark import anchors as trivial
 from codetr_ros.benchmark import curves, scores, sections, table
 from codetr_ros.benchmark.folder import Folder
 from codetr_ros.benchmark.results import Result, read
+from codetr_ros.config import delay_in_words
 from codetr_ros.runs.document import Block, Heading, markdown, page
 from codetr_ros.simulation import tasks
 from codetr_ros.system.files import atomic_write
@@ -75,7 +76,8 @@ def _pictures(results: Sequence[Result], anchors: trivial.Anchors) -> Iterator[t
         name = some[0].cell.split(f'_{some[0].method}_seed')[0]
         seeds = len({result.seed for result in some if result.summary})
         task, composite, delay = key
-        title = f'{task}: {composite} of {delay} steps; mean and range over seeds ({seeds})'
+        what = f'{task}: {composite} of {delay_in_words(delay)}'
+        title = f'{what}; mean and range over seeds ({seeds})'
         yield f'learning_{name}.png', curves.learning_curves(some, order, numbers, title)
         picture = curves.recovery_curves(some, order, f'Reward recovery. {title}')
         if picture is not None:

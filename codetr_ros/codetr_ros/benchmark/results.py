@@ -32,7 +32,7 @@ class Result:
     folder: Path
     task: str
     composite: str
-    delay: int
+    delay: int | str
     method: str
     seed: int
     settings: Mapping[str, Any]

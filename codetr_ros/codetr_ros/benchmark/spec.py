@@ -3,7 +3,7 @@
     methods: [codetr, none, 'true']
     tasks: [HalfCheetah-v5]
     composites: [sum, max]
-    delays: [25]
+    delays: [25]                # also drawn lengths, 10:50, and episode
     seeds: [0, 1, 2]
     steps: 30000
     config:                     # optional; without it, the preset quick
@@ -25,7 +25,7 @@ import yaml
 from pydantic import Field, ValidationError, field_validator
 
 from codetr_ros import config
-from codetr_ros.config import Composite, Group, Method, Settings, SettingsError
+from codetr_ros.config import Composite, Delay, Group, Method, Settings, SettingsError
 from codetr_ros.simulation import tasks
 
 DEFAULT_BASE = 'quick'
@@ -63,7 +63,7 @@ class _Keys(Group):
     methods: tuple[Method, ...] = Field(min_length=1)
     tasks: tuple[Annotated[str, Field(min_length=1)], ...] = Field(min_length=1)
     composites: tuple[Composite, ...] = Field(min_length=1)
-    delays: tuple[int, ...] = Field(min_length=1)
+    delays: tuple[Delay, ...] = Field(min_length=1)
     seeds: tuple[int, ...] = Field(min_length=1)
     steps: int = Field(ge=1)
     config: str | dict[str, Any] = DEFAULT_BASE
@@ -119,7 +119,7 @@ def load(path: Path) -> Spec:
             does not exist. Names key, value and file.
     """
     try:
-        data = yaml.safe_load(path.read_text())
+        data = config.read_yaml(path.read_text())
     except OSError as error:
         raise BenchmarkError(f'spec {path} cannot be read: {error.strerror}') from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -201,6 +201,7 @@ def _cells(keys: _Keys, base: Settings, path: Path) -> Iterator[Cell]:
         yield Cell(name, settings)
 
 
-def cell_name(task: str, composite: str, delay: int, method: str, seed: int) -> str:
+def cell_name(task: str, composite: str, delay: int | str, method: str, seed: int) -> str:
     """The name of a cell and of its folder, such as HalfCheetah-v5_sum_25_codetr_seed0."""
-    return f'{re.sub(r"[^A-Za-z0-9.-]+", "-", task)}_{composite}_{delay}_{method}_seed{seed}'
+    plain, steps = (re.sub(r'[^A-Za-z0-9.-]+', '-', str(name)) for name in (task, delay))
+    return f'{plain}_{composite}_{steps}_{method}_seed{seed}'

@@ -12,6 +12,8 @@ from codetr_ros.benchmark.statistics import (
     paired_p,
     spread,
 )
+from codetr_ros.config import Lengths
+from codetr_ros.config.delays import LONGEST
 
 TABLE_DELAYS = (25, 200)
 """A cell of Table 2 is the mean over delays from 25 to 200. The supplement says "utilizing various
@@ -19,7 +21,7 @@ delayed steps ranging from 25 to 200"; that one number averages over them is inf
 ORACLES = ('true',)
 """Methods that see rewards hidden from all others: shown, but never best, nor compared."""
 
-Pair = tuple[int, int]  # seed, delay
+Pair = tuple[int, int | str]  # seed, delay
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +69,7 @@ class Row:
 
     task: str
     composite: str
-    delays: tuple[int, ...]
+    delays: tuple[int | str, ...]
     entries: tuple[Entry, ...]
 
 
@@ -79,7 +81,8 @@ def methods(results: Sequence[Result]) -> list[str]:
 def rows(results: Sequence[Result]) -> tuple[list[Row], list[Row]]:
     """The rows over delays 25 to 200, and those of each delay alone.
 
-    A task and composite reward without a delay in that range has no row of the first kind.
+    A task and composite reward without a delay in that range has no row of the first kind. Lengths
+    that are drawn and whole episodes have rows of their own only.
     """
     groups: dict[tuple[str, str], list[Result]] = defaultdict(list)
     for result in results:
@@ -87,14 +90,21 @@ def rows(results: Sequence[Result]) -> tuple[list[Row], list[Row]]:
     low, high = TABLE_DELAYS
     together, alone = [], []
     for (task, composite), group in groups.items():
-        delays = sorted({result.delay for result in group})
-        if within := tuple(delay for delay in delays if low <= delay <= high):
+        delays = sorted({result.delay for result in group}, key=_longest)
+        numbers = (delay for delay in delays if isinstance(delay, int))
+        if within := tuple(delay for delay in numbers if low <= delay <= high):
             together.append(_row(task, composite, within, group))
         alone += [_row(task, composite, (delay,), group) for delay in delays]
     return together, alone
 
 
-def _row(task: str, composite: str, delays: tuple[int, ...], group: Sequence[Result]) -> Row:
+def _longest(delay: int | str) -> tuple[int, int]:
+    """The place of a delay in a table: by its longest segments, whole episodes last."""
+    lengths = Lengths.of(delay)
+    return lengths.most or LONGEST + 1, lengths.least
+
+
+def _row(task: str, composite: str, delays: tuple[int | str, ...], group: Sequence[Result]) -> Row:
     inside = [result for result in group if result.delay in delays]
     entries = [
         _entry(method, [result for result in inside if result.method == method])
@@ -109,7 +119,7 @@ def _entry(method: str, results: Sequence[Result]) -> Entry:
         return {pair: float(value) for pair, value in values.items() if value is not None}
 
     scores, returns = of('score'), of('true_return')
-    strata: dict[int, list[float]] = defaultdict(list)
+    strata: dict[int | str, list[float]] = defaultdict(list)
     for (_, delay), score in scores.items():
         strata[delay].append(score)
     values = list(scores.values())
@@ -182,7 +192,7 @@ def aggregate(together: Sequence[Row]) -> list[Aggregate]:
     """Each method over all composite rewards of a task; strata are composite reward and delay."""
     aggregates = []
     for task in dict.fromkeys(row.task for row in together):
-        strata: dict[str, dict[tuple[str, int], list[float]]] = defaultdict(
+        strata: dict[str, dict[tuple[str, int | str], list[float]]] = defaultdict(
             lambda: defaultdict(list)
         )
         for row in together:

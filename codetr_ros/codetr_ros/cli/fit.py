@@ -152,15 +152,16 @@ def _epochs(arguments: Sequence[str], given: Arguments) -> int:
     settings = given.settings
     _refuse_unfit(settings)
     longest = min(given.fit.stretch_steps, max(1, settings.memory_steps // 4))
-    data = stretches(index, settings.delay, longest)
+    data = stretches(index, settings.longest, longest)
     plan = fitting.plan(data.usable, settings, given.fit)
     sizes = index.observation_size, index.action_size
     method = saved.restore(start, settings, *sizes) if start else None
     folder = results.make_folder(given.out)
     run_folder.write_settings(folder, settings)
     shown.print(
-        f'method {settings.method}, delay {settings.delay}: {len(plan.learnt)} stretches to learn '
-        f'from in {plan.passes} {"part" if plan.passes == 1 else "parts"}, '
+        f'method {settings.method}, {config.delay_in_words(settings.delay)}: '
+        f'{len(plan.learnt)} stretches to learn from in {plan.passes} '
+        f'{"part" if plan.passes == 1 else "parts"}, '
         f'{len(plan.held_out)} held out'
     )
     fitted = fitting.fit(
@@ -260,12 +261,13 @@ def _phases(arguments: Sequence[str], given: Arguments) -> int:
         given.frozen,
     )
     seconds = time.perf_counter() - began
-    data = stretches(index, own.delay, given.fit.stretch_steps)
+    longest = index.within(own).longest
+    data = stretches(index, longest, given.fit.stretch_steps)
     judged = None
     if folded.core.method is not None and folded.core.method.target_scale:
         newest = list(loading.newest(data.usable, given.settings.memory_steps))
         sizes = index.observation_size, index.action_size
-        loaded = loading.load(index.bags, newest, sizes, own.delay, true_rewards=True)
+        loaded = loading.load(index.bags, newest, sizes, longest, true_rewards=True)
         judged = judging.judge(folded.core.method, loaded)
     summary = results.of_phases(folded, index, data, own, given.fit, judged, seconds, live)
     results.write(folder, summary)

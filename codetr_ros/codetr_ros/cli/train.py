@@ -202,8 +202,8 @@ def train(
     summary = Summary(settings, run_id, topics is None, command=command)
     progress = Progress(settings)
     progress.log(
-        f'{settings.task}: {settings.composite} of {settings.delay} steps, method '
-        f'{settings.method}, {settings.steps} steps, seed {settings.seed}'
+        f'{settings.task}: {settings.composite} of {config.delay_in_words(settings.delay)}, '
+        f'method {settings.method}, {settings.steps} steps, seed {settings.seed}'
         + (', in process' if topics is None else '')
     )
     progress.log(f'output: {results.short(folder)}')

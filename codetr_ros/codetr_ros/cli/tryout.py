@@ -81,8 +81,8 @@ def _environment(settings: Settings) -> None:
     environment = tasks.make(settings.task)
     try:
         steps_of_chunks(environment)
-        episode = EpisodeRunner(environment, settings)
-        episode.reset(0)
+        episode = EpisodeRunner(environment, settings, 'tryout')
+        episode.reset(0, 0)
         episode.step(np.zeros(environment.action_size, np.float32))
     finally:
         environment.close()

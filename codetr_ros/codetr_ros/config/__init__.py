@@ -9,8 +9,10 @@ from codetr_ros.config.base import (
     flatten,
     in_words,
     names,
+    read_yaml,
     validate,
 )
+from codetr_ros.config.delays import Delay, Lengths, delay_in_words
 from codetr_ros.config.loading import (
     PRESETS,
     differences,
@@ -40,9 +42,11 @@ __all__ = [
     'SCORE_LEARNERS',
     'CodetrSettings',
     'Composite',
+    'Delay',
     'DiasterSettings',
     'Group',
     'HcSettings',
+    'Lengths',
     'LirpgSettings',
     'LrrSettings',
     'Method',
@@ -54,6 +58,7 @@ __all__ = [
     'SacSettings',
     'Settings',
     'SettingsError',
+    'delay_in_words',
     'differences',
     'explain',
     'flatten',
@@ -63,5 +68,6 @@ __all__ = [
     'names',
     'nearest',
     'parse',
+    'read_yaml',
     'validate',
 ]

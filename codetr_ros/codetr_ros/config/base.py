@@ -1,12 +1,15 @@
 """The base of all settings: how they are validated, and what a refusal names."""
 
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, TypeVar
 
+import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from codetr_ros.system.similar import did_you_mean
 
+_SEXAGESIMAL = re.compile(r'[-+]?[0-9][0-9_]*(:[0-9]+)+(\.[0-9_]*)?')
 _IN_WORDS: dict[str, str] = {}
 
 
@@ -35,6 +38,25 @@ class Group(BaseModel):
     model_config = ConfigDict(
         extra='forbid', frozen=True, validate_default=True, allow_inf_nan=False
     )
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads `10:50` as text, where YAML 1.1 has a number of base 60."""
+
+    def resolve(self, kind: Any, value: Any, implicit: Any) -> Any:
+        """The tag of a node."""
+        if kind is yaml.ScalarNode and implicit[0] and _SEXAGESIMAL.fullmatch(value):
+            return 'tag:yaml.org,2002:str'
+        return super().resolve(kind, value, implicit)  # type: ignore[no-untyped-call]
+
+
+def read_yaml(text: str) -> Any:
+    """What is in YAML that people write.
+
+    Raises:
+        yaml.YAMLError: it is not YAML.
+    """
+    return yaml.load(text, _Loader)
 
 
 def flatten(data: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from codetr_ros.config.base import SettingsError, flatten, validate
+from codetr_ros.config.base import SettingsError, flatten, read_yaml, validate
 from codetr_ros.config.run import Settings
 
 PRESETS = ('quick', 'cpu', 'paper')
@@ -44,7 +44,7 @@ def load(name: str) -> Settings:
             )
         text, source = path.read_text(), str(path)
     try:
-        data = yaml.safe_load(text)
+        data = read_yaml(text)
     except yaml.YAMLError as error:
         raise SettingsError(f'{source} is not YAML: {error}') from None
     if not isinstance(data, Mapping):

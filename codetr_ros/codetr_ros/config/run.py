@@ -14,6 +14,7 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from codetr_ros.config.base import Group, SettingsError, flatten, in_words, validate
+from codetr_ros.config.delays import Delay, Delayed
 from codetr_ros.config.methods import (
     CodetrSettings,
     DiasterSettings,
@@ -79,7 +80,7 @@ SCORE_LEARNERS: tuple[str, ...] = ('hc', 'lirpg')
 that labels steps."""
 
 
-class Settings(Schedule, Group):
+class Settings(Schedule, Delayed, Group):
     """Everything that the nodes of a run must agree on."""
 
     task: str = Field(
@@ -93,11 +94,10 @@ class Settings(Schedule, Group):
     beta: float = Field(
         3.0, gt=0, le=1000, description='inverse temperature of the soft maximum and minimum'
     )
-    delay: int = Field(
+    delay: Delay = Field(
         25,
-        ge=1,
-        le=100_000,
-        description='steps n of a segment; each segment has one composite reward',
+        description='steps n of a segment; each segment has one composite reward. 10:50 draws the '
+        'length of each from 10 to 50 steps; episode: a segment is a whole episode',
     )
     method: Method = Field(
         'codetr', description='how step rewards are made from composite rewards'
@@ -260,6 +260,10 @@ class Settings(Schedule, Group):
     def relabels_all(self) -> bool:
         """Whether each version of the reward model labels all of the memory."""
         return self.relabel == 'all' and not self.relabel_steps
+
+    def within(self, horizon: int) -> 'Settings':
+        """The same settings for a task of this horizon: `delay` episode means that many steps."""
+        return self if self.lengths.most else self.model_copy(update={'delay': horizon})
 
     def canonical(self) -> str:
         """The settings as JSON. Equal settings give the same text on every machine."""

@@ -72,14 +72,16 @@ class Consumer(Part, ABC):
         """This side of Algorithm 1; one slice per `next()`."""
         while not self._intake.tasks.known:
             yield None
-        spec, settings = self._intake.tasks.first, self._settings
+        spec = self._intake.tasks.first
+        self._settings = settings = self._settings.within(spec.horizon)
         self._memory = Trajectories(
             spec.observation_size,
             spec.action_size,
-            settings.delay,
+            settings.longest,
             settings.memory_steps,
             settings.phase_steps + spec.horizon,
             self._true_rewards,
+            regular=not settings.lengths.drawn,
         )
         yield from self._begin()
         for phase in range(settings.phases):
@@ -125,6 +127,7 @@ class Consumer(Part, ABC):
             'run_id': self._run.run_id,
             'settings': self._run.settings,
             'task': spec.task,
+            'horizon': spec.horizon,
             'observation_size': spec.observation_size,
             'action_size': spec.action_size,
             'phase': done,

@@ -40,7 +40,7 @@ class Evaluator(Part):
         self._name = name
         seed_global(settings.seed, 'environment')  # the same as the simulator's
         self._environment = make(settings.task)
-        self._episode = EpisodeRunner(self._environment, settings)
+        self._episode = EpisodeRunner(self._environment, settings, 'evaluate')
         self._waiting: deque[tuple[str, int, ActingPolicy | None]] = (
             deque()
         )  # purpose, version, policy
@@ -63,7 +63,7 @@ class Evaluator(Part):
             self._seen.add(INITIAL_VERSION)
             self._waiting.append(('random', INITIAL_VERSION, None))
         if settings.evaluated(policy.version) and policy.version not in self._seen:
-            acting = acting_policy(policy, self._environment, settings.delay)
+            acting = acting_policy(policy, self._environment, settings)
             self._seen.add(policy.version)
             self._waiting.append(('evaluation', policy.version, acting))
 
@@ -88,13 +88,16 @@ class Evaluator(Part):
         """Run one episode, from the start state that its number gives."""
         seed, episode, environment = self._settings.seed, self._episode, self._environment
         seed_global(seed, 'environment', 'evaluate', number)
-        episode.reset(int(generator(seed, 'evaluate', number).integers(2**31)))
+        episode.reset(int(generator(seed, 'evaluate', number).integers(2**31)), number)
         if acting is None:
             rng = generator(seed, 'evaluate', 'random', number)
             actions = uniform_actions(rng, environment.horizon, environment.action_size)
         while not episode.over:
-            t = episode.length
-            episode.step(actions[t] if acting is None else acting.act(episode.observation, step=t))
+            if acting is None:
+                action = actions[episode.length]
+            else:
+                action = acting.act(episode.observation, step=episode.place)
+            episode.step(action)
         self._counters.update(episodes=1, steps=episode.length)
         step = self._settings.steps_after(version)  # 0 for the initial version
         return episode.result(self._run.run_id, self._name, purpose, step, version, number)

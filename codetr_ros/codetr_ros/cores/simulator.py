@@ -83,7 +83,7 @@ class Simulator(Part):
                     f'{source.name!r}: start the run with simulators={needed}, or stop this one'
                 )
         environment = self._sources[0].environment
-        acting = None if ends else acting_policy(policy, environment, self._settings.delay)
+        acting = None if ends else acting_policy(policy, environment, self._settings)
         self._waiting[policy.phase] = policy, acting
 
     def work(self) -> Iterator[list[Record] | None]:

@@ -87,7 +87,9 @@ class HC(OffPolicy):
         self.target_scale = 0.0
         self._steps: ScoredSteps | None = None
         self._actor = Actor(observation_size + 1, action_size, sac.hidden)
-        self.network = describe_network(observation_size, action_size, sac.hidden, settings.delay)
+        self.network = describe_network(
+            observation_size, action_size, sac.hidden, settings.longest
+        )
         self.critic = Critic(settings, observation_size, action_size)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
         self.target_entropy = sac.target_entropy * action_size
@@ -214,7 +216,7 @@ class HC(OffPolicy):
 
     def _placed(self, observations: Tensor, steps: Tensor) -> Tensor:
         """Observations (B, O) with how far the segment is after `steps` (B,) of its n steps."""
-        place = (steps / self._settings.delay).to(observations.dtype)
+        place = (steps / self._settings.longest).to(observations.dtype)
         return torch.cat([observations, place[:, None]], -1)
 
     def state(self) -> dict[str, Tensor]:

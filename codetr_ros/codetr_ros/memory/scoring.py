@@ -40,6 +40,8 @@ def unscored(
         raise RecordError(
             f'{named}: the segment has its composite reward already; the first one is kept'
         )
+    if source.scored.meets(row, reward.length, min(delay - 1, reward.first_step)):
+        raise RecordError(f'{named}: another score covers some of these steps already; it is kept')
     return source, row
 
 

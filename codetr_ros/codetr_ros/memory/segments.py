@@ -30,7 +30,7 @@ class Segments:
         store: where the steps lie.
         delay: steps n of a segment.
         regular: segments follow on each other from an episode's first step on, and only its last
-            is shorter. Else they may lie anywhere and have 1 to `delay` steps.
+            is shorter. Else they may lie anywhere, have 1 to `delay` steps, and share none.
     """
 
     def __init__(self, store: Store, delay: int, regular: bool) -> None:
@@ -165,16 +165,16 @@ class Segments:
         return spans
 
     def runs(self, ids: I64, longest: int) -> list[I64]:
-        """Each segment with the whole ones right before it in its episode, in order.
+        """Each segment with those right before it in its episode, in order.
 
         Args:
             ids: the segments with which the runs end.
-            longest: segments in a run at the most; those before the last have `delay` steps.
+            longest: segments in a run at the most.
         """
         runs = [ids[i : i + 1] for i in range(len(ids))]
         for index, source, mine, at in self._by_source(ids):
             for i, place in zip(mine.tolist(), at.tolist(), strict=True):
-                before = source.scored.whole_before(place, self._delay, longest - 1)
+                before = source.scored.right_before(place, self._delay, longest - 1)
                 runs[i] = np.append(segment_ids(index, np.array(before, np.int64)), ids[i])
         return runs
 

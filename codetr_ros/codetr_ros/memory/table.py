@@ -57,23 +57,50 @@ class SegmentTable:
         table = table[np.argsort(self.rows[table], kind='stable')]
         return table[np.searchsorted(self.rows[table], rows, side='right') - 1]
 
-    def whole_before(self, at: int, steps: int, most: int) -> list[int]:
-        """Numbers of the whole segments that lie right before one in its episode, in order.
+    def meets(self, row: int, length: int, before: int) -> bool:
+        """Whether a segment has some of `length` steps from a row on.
+
+        Args:
+            row: of the first step.
+            length: number of steps.
+            before: steps of the episode before them in which such a segment may begin.
+        """
+        number = self._last_beginning(row + length, length + before)
+        if number is None:
+            return False
+        at = number - self.first
+        return int(self.rows[at] + self.lengths[at]) > row
+
+    def right_before(self, at: int, steps: int, most: int) -> list[int]:
+        """Numbers of the segments that lie right before one in its episode, each ending where the
+        next begins, in order.
 
         Args:
             at: the place of that one in the table.
-            steps: of a whole segment.
+            steps: of the longest segment.
             most: the most to return.
         """
         row, first = int(self.rows[at]), int(self.offsets[at])
         numbers: list[int] = []
         while len(numbers) < most:
-            back = (len(numbers) + 1) * steps
-            number = self.beginning_at(row - back) if back <= first else None
-            if number is None or self.lengths[number - self.first] < steps:
+            number = self._last_beginning(row, min(steps, first))
+            if number is None:
+                break
+            length = int(self.lengths[number - self.first])
+            if int(self.rows[number - self.first]) + length != row:
                 break
             numbers.append(number)
+            row, first = row - length, first - length
         return numbers[::-1]
+
+    def _last_beginning(self, row: int, back: int) -> int | None:
+        """The number of the last segment that begins in the `back` rows before this one."""
+        if not self.count:
+            return None
+        rows = np.arange(row - 1, row - 1 - back, -1)
+        begins = self._beginning[rows % self.capacity]
+        places = np.flatnonzero(begins)
+        return int(begins[places[0]]) - 1 if len(places) else None
 
     def add(self, row: int, length: int, offset: int, episode: int, value: float) -> None:
         """Add a segment."""

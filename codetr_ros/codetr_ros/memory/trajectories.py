@@ -28,8 +28,8 @@ class Trajectories:
             episode.
         true_rewards: keep the environment's own rewards too, for the oracle.
         regular: segments have `delay` steps and follow on each other from an episode's first step
-            on, only its last is shorter. Else they may lie anywhere and have 1 to `delay` steps;
-            the caller must see to it that no two share a step.
+            on, only its last is shorter. Else they may lie anywhere and have 1 to `delay` steps,
+            as long as no two share a step.
     """
 
     def __init__(

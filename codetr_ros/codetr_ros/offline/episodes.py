@@ -89,6 +89,7 @@ class Index:
     tasks: list[str] = field(default_factory=list)
     observation_size: int = 0
     action_size: int = 0
+    horizon: int = 0  # of their tasks, the longest; 0 where no bag states it
     episodes: dict[tuple[Key, int], Episode] = field(default_factory=dict)
     steps: int = 0
     scores: int = 0
@@ -159,6 +160,7 @@ class Index:
     def _task(self, number: int, spec: TaskSpec) -> None:
         who = f'{spec.source!r} in {self.bags[number].path}'
         self._sizes(spec.observation_size, spec.action_size, who)
+        self.horizon = max(self.horizon, spec.horizon)
         if spec.task not in self.tasks:
             self.tasks.append(spec.task)
             if len(self.tasks) > 1:
@@ -250,13 +252,17 @@ class Index:
             longest = max(longest, max((n for n in episode.lengths if n <= most), default=1))
         return longest
 
+    def within(self, settings: Settings) -> Settings:
+        """The settings of a run for the episodes of these bags: how long a whole one may be."""
+        return settings.within(self.horizon or self.longest)
+
     def base(self) -> Settings:
         """The settings of the first run that has them, else of the preset `quick`."""
         return self.settings[0] if self.settings else load('quick')
 
     def facts(self) -> dict[str, Any]:
         """Settings that the data decides: the task, and the steps that a score is of."""
-        known = max((settings.delay for settings in self.settings), default=0)
+        known = max((self.within(settings).longest for settings in self.settings), default=0)
         delay = max(known, self.longest)
         if delay != known:
             why = (

@@ -159,7 +159,7 @@ def fit(
     torch.set_num_threads(settings.threads)
     began = time.perf_counter()
     method = method or registry.make(settings, *sizes)
-    held_out = load(bags, made.held_out, sizes, settings.delay, true_rewards=True)
+    held_out = load(bags, made.held_out, sizes, settings.longest, true_rewards=True)
     fitted = Fitted(method, held_out, method.gradient_steps, reads=1)
     try:
         _fit(bags, made, sizes, settings, how, fitted, report)
@@ -188,7 +188,7 @@ def _fit(
         if turn and not isinstance(method, Learned):
             fitted.stopped = f'method {method.name} takes no gradient steps'
             break
-        learnt = load(bags, part, sizes, settings.delay)
+        learnt = load(bags, part, sizes, settings.longest)
         fitted.reads += 1
         steps = learnt.memory.steps + fitted.held_out.memory.steps
         fitted.most_steps = max(fitted.most_steps, steps)

@@ -63,7 +63,7 @@ def label(bag: Bag, saved: SavedModel, folder: Path, memory_steps: int) -> Label
     index = Index([bag]).read()
     settings = saved.settings
     method = restore(saved, settings, index.observation_size, index.action_size)
-    data = stretches(index, settings.delay, min(STRETCH_STEPS, max(1, memory_steps // 4)))
+    data = stretches(index, settings.longest, min(STRETCH_STEPS, max(1, memory_steps // 4)))
     made = Labelled(unlabelled=data.unscored, skipped=data.skipped)
     messages = _messages(bag, index, method, data.usable, memory_steps, made)
     with unfinished(folder, 'label again') as new:

@@ -107,8 +107,8 @@ class ActingPolicy:
         Args:
             observation: (O,), finite.
             noise: (A,) standard normal numbers; None for the deterministic action.
-            step: number of the step in its episode; a policy that sees how far the segment is
-                needs it.
+            step: number of the step in its segment; a policy that sees how far the segment is
+                needs it. Where all have n steps, its number in the episode does as well.
 
         Returns:
             (A,) in [-1, 1]: tanh(mean), or tanh(mean + std * noise).
@@ -121,7 +121,7 @@ class ActingPolicy:
             if step is None:
                 raise NetworkError(
                     'this policy sees how far the segment is: give it the number of the step in '
-                    'its episode'
+                    'its segment'
                 )
             place = step % self._segment_steps / self._segment_steps
             x = torch.cat([x, torch.tensor([place])])

@@ -36,8 +36,9 @@ def describe_network(
         observation_size: O of the task.
         action_size: A of the task.
         hidden: widths of the hidden layers.
-        segment_steps: steps n of a segment if the policy sees how far the segment is, as one more
-            input: (t - t_i) / n for step t of a segment that began at t_i. 0 if it does not.
+        segment_steps: steps n of the longest segment if the policy sees how far the segment is, as
+            one more input: (t - t_i) / n for step t of a segment that began at t_i. 0 if it does
+            not.
         kind: the network's name in `KINDS`.
     """
     description = {

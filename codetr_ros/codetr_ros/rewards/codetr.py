@@ -51,7 +51,7 @@ class Codetr(SequenceMethod):
         codetr = settings.codetr
         before = {
             'segment': 0,
-            'window': max(0, codetr.window - settings.delay),
+            'window': max(0, codetr.window - settings.longest),
             'episode': codetr.window,
         }
         super().__init__(

@@ -45,6 +45,7 @@ from torch import Tensor, nn
 
 from codetr_ros.config import CodetrSettings, Settings
 from codetr_ros.memory.trajectories import Trajectories
+from codetr_ros.records import I64
 from codetr_ros.rewards.base import segment_steps
 from codetr_ros.rewards.learned import CLIP
 from codetr_ros.rewards.sequence import SequenceMethod
@@ -65,8 +66,8 @@ class Rbt(SequenceMethod):
 
     def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
         several = settings.rbt.attention_scope == 'window'
-        self._segments = max(2, settings.codetr.window // settings.delay) if several else 1
-        context = (self._segments - 1) * settings.delay
+        self._segments = max(2, settings.codetr.window // settings.longest) if several else 1
+        context = (self._segments - 1) * settings.longest
         super().__init__(settings, observation_size, action_size, context, whole_window=several)
 
     def _make_network(self, observation_size: int, action_size: int) -> 'BagTransformer':
@@ -80,16 +81,16 @@ class Rbt(SequenceMethod):
         last = ids[rng.integers(0, len(ids), -(-self._codetr.batch // self._segments))]
         windows = memory.segments.runs(last, self._segments)
         batch = memory.segments.batch(np.concatenate(windows))  # (S, n): S segments of all windows
-        row, place = places([len(window) for window in windows])
-        inside = side_by_side(self._put(segment_steps(batch)), row, place)  # (B, L)
+        layout = Layout([len(window) for window in windows], batch.lengths)
+        own = self._put(segment_steps(batch))  # (S, n)
+        inside = layout.side_by_side(own)  # (B, L)
         before = self._standardised(batch.observations[:, :-1])
-        observations = side_by_side(before, row, place)  # (B, L, O)
-        actions = side_by_side(self._put(batch.actions), row, place)  # (B, L, A)
+        observations = layout.side_by_side(before)  # (B, L, O)
+        actions = layout.side_by_side(self._put(batch.actions))  # (B, L, A)
         rewards, predicted = self.network(observations, actions, inside)  # (B, L), (B, L, O)
         after = self._standardised(batch.observations[:, 1:])
-        following = side_by_side(after, row, place)  # (B, L, O)
-        each = rewards.view(len(windows), -1, batch.actions.shape[1])[row, place]  # (S, n)
-        sums = each.sum(1)  # (S,)
+        following = layout.side_by_side(after)  # (B, L, O)
+        sums = (layout.taken_apart(rewards) * own).sum(1)  # (S,)
         state_loss = (predicted - following)[inside].square().mean()
         yield {
             'reward_loss': (sums - self._scaled(batch.values)).square().mean(),
@@ -101,21 +102,42 @@ class Rbt(SequenceMethod):
         return rewards
 
 
-def places(sizes: list[int]) -> tuple[Tensor, Tensor]:
-    """Each segment's window, and its place in it, for windows of these numbers of segments."""
-    row = torch.repeat_interleave(torch.tensor(sizes))
-    return row, torch.cat([torch.arange(size) for size in sizes])
+class Layout:
+    """Where the steps of segments, padded to n, lie in windows of several segments.
 
+    The segments of a window follow on each other without a gap. Windows have room for L steps: for
+    as many segments as the largest has, each as long as the longest.
 
-def side_by_side(each: Tensor, row: Tensor, place: Tensor) -> Tensor:
-    """Steps of segments (S, n, ...), laid out in their windows (B, L, ...), 0 elsewhere.
-
-    All segments but the last of a window are as long as the longest, so that its steps follow on
-    each other and padding lies on the right.
+    Args:
+        sizes: numbers of segments of the windows (B,).
+        lengths: steps of all segments (S,), window after window.
     """
-    laid = each.new_zeros(int(row[-1]) + 1, int(place.max()) + 1, *each.shape[1:])
-    laid[row, place] = each
-    return laid.flatten(1, 2)
+
+    def __init__(self, sizes: list[int], lengths: I64) -> None:
+        self.row = torch.repeat_interleave(torch.tensor(sizes))  # (S,) each segment's window
+        self.first = torch.empty(len(lengths), dtype=torch.int64)  # (S,) its first step's place
+        steps = torch.from_numpy(lengths)
+        for part in torch.split(torch.arange(len(lengths)), sizes):
+            self.first[part] = steps[part].cumsum(0) - steps[part]
+        n = int(steps.max())
+        self.size = len(sizes), max(sizes) * n  # B, L
+        ends = torch.cumsum(torch.tensor(sizes), 0) - 1
+        # the last of a window with its padding, the others without: no two share a place
+        taken = torch.arange(n) < steps[:, None]
+        taken[ends] = True
+        self._segment, self._step = taken.nonzero(as_tuple=True)
+        self._n = n
+
+    def side_by_side(self, each: Tensor) -> Tensor:
+        """Steps of segments (S, n, ...), laid out in their windows (B, L, ...), 0 elsewhere."""
+        laid = each.new_zeros(*self.size, *each.shape[2:])
+        segment, step = self._segment, self._step
+        laid[self.row[segment], self.first[segment] + step] = each[segment, step]
+        return laid
+
+    def taken_apart(self, laid: Tensor) -> Tensor:
+        """Numbers of the steps of windows (B, L) as (S, n); of any value beyond a segment."""
+        return laid[self.row[:, None], self.first[:, None] + torch.arange(self._n)]
 
 
 class BagTransformer(nn.Module):

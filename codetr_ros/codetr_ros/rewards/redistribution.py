@@ -63,7 +63,7 @@ class StepReward(Redistribution):
 
     def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
         super().__init__(settings, observation_size, action_size)
-        self._link = links.make(settings.composite, settings.beta, settings.delay)
+        self._link = links.make(settings.composite, settings.beta, settings.longest)
 
     def prepare(self, memory: Trajectories) -> None:
         """Freeze the scale of levels, the first time."""

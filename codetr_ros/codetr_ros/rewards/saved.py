@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 
 from codetr_ros.config import Settings, from_canonical
+from codetr_ros.config.delays import LONGEST
 from codetr_ros.rewards import registry
 from codetr_ros.rewards.base import RewardMethod, RewardModelError
 from codetr_ros.rewards.sequence import SequenceMethod
@@ -71,6 +72,7 @@ def read(path: Path) -> SavedModel:
     tensors, meta = checkpoints.load(chosen)
     try:
         settings = from_canonical(meta['settings'], f'checkpoint {chosen}')
+        settings = settings.within(meta.get('horizon', LONGEST))
         sizes = int(meta['observation_size']), int(meta['action_size'])
         task = str(meta['task'])
     except KeyError as error:
@@ -137,9 +139,12 @@ def _differing(theirs: Settings, ours: Settings) -> list[tuple[str, object, obje
     kind = registry.kind(ours)
     groups = {getattr(kind, 'group', ''), ours.method}
     mine, saved = ours.flat(), theirs.flat()
-    names = [*_SHARED, *(['delay'] if issubclass(kind, SequenceMethod) else [])]
+    names = [*_SHARED]
     for name in mine:
         group, _, last = name.rpartition('.')
         if group and group in groups and last not in _OF_TRAINING:
             names.append(name)
-    return [(name, saved[name], mine[name]) for name in names]
+    differing: list[tuple[str, object, object]] = [(n, saved[n], mine[n]) for n in names]
+    if issubclass(kind, SequenceMethod):
+        differing.insert(len(_SHARED), ('delay', theirs.longest, ours.longest))
+    return differing

@@ -61,7 +61,7 @@ class SequenceMethod(Learned):
         self.context = context
         self.label_batch = settings.codetr.label_batch
         self._whole_window = whole_window
-        self._positions = max(settings.delay + context, settings.codetr.window)
+        self._positions = max(settings.longest + context, settings.codetr.window)
         self._on_device: DeviceSteps | None = None
         freed_memory.keep()
         super().__init__(settings, observation_size, action_size)

@@ -19,6 +19,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from codetr_ros.config import Settings, SettingsError, load
+from codetr_ros.config.delays import Whole
 
 Type = Parameter.Type
 NOT_GIVEN = 0.0
@@ -139,7 +140,9 @@ def _bounds(field: Any) -> tuple[float | None, float | None, list[str]]:
     high: Any = None
     constraints = []
     for rule in field.metadata:
-        if isinstance(rule, (Ge, Gt)):
+        if isinstance(rule, Whole):
+            low, high = rule.ge, rule.le
+        elif isinstance(rule, (Ge, Gt)):
             low = rule.ge if isinstance(rule, Ge) else rule.gt
             if isinstance(rule, Gt):
                 constraints.append(f'greater than {low:g}')
@@ -155,17 +158,24 @@ def _bounds(field: Any) -> tuple[float | None, float | None, list[str]]:
 
 
 def _plain(annotation: Any) -> tuple[Any, bool]:
-    """The type behind `T | None`, and whether None is allowed."""
+    """The first of several types, and whether None is allowed."""
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
         inner = [a for a in typing.get_args(annotation) if a is not type(None)]
-        return inner[0], True
+        return inner[0], type(None) in typing.get_args(annotation)
     return annotation, False
 
 
-def descriptor(name: str) -> ParameterDescriptor:
-    """Type, description and range of a setting, from its pydantic field."""
+def descriptor(name: str, value: Any = None) -> ParameterDescriptor:
+    """Type, description and range of a setting, from its pydantic field.
+
+    Args:
+        name: the setting.
+        value: its value, which decides where a setting may be a number or text.
+    """
     field = FIELDS[name]
     kind, optional = _plain(field.annotation)
+    if isinstance(value, str) and kind is int:
+        kind = str
     low, high, constraints = _bounds(field)
     shown = ParameterDescriptor(description=field.description or '', read_only=True)
     if typing.get_origin(kind) is Literal:
@@ -272,7 +282,7 @@ def declare_own(node: Node, role: str) -> dict[str, Any]:
 def declare_settings(node: Node, settings: Settings) -> None:
     """Declare every setting as a read-only parameter with the run's value."""
     for name, value in settings.flat().items():
-        shown = descriptor(name)
+        shown = descriptor(name, value)
         node.declare_parameter(
             name,
             Parameter(name, Type(shown.type), _outward(value)).value,

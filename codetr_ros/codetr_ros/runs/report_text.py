@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from codetr_ros.config import delay_in_words
 from codetr_ros.runs.numbers import column, number
 from codetr_ros.runs.run_summary import RewardRecovery, RunSummary
 
@@ -9,7 +10,7 @@ from codetr_ros.runs.run_summary import RewardRecovery, RunSummary
 def title(summary: RunSummary) -> str:
     """Names the run in a line."""
     s = summary
-    what = f'{s.task}, {s.composite} of {s.delay} steps, {s.method}, seed {s.seed}'
+    what = f'{s.task}, {s.composite} of {delay_in_words(s.delay)}, {s.method}, seed {s.seed}'
     return what + (' (interrupted)' if s.interrupted else '')
 
 

@@ -101,7 +101,10 @@ class RunSummary(Facts):
         'otherwise, and in the first summaries',
     )
     composite: str = Field(description="how a segment's rewards made its composite reward")
-    delay: int = Field(description='length n of a segment [steps]')
+    delay: int | str = Field(
+        description='length n of a segment [steps]; 10:50: drawn between these; episode: whole '
+        'episodes'
+    )
     method: str = Field(description='how step rewards were made from composite rewards')
     seed: int = Field(description='seed of everything random')
     overlap: bool = Field(description='whether simulation ran a phase ahead of learning')

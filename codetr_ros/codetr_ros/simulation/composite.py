@@ -1,11 +1,11 @@
 """Composite delayed rewards: one number for the m <= n steps of a segment (the paper's R_co).
 
-The delay n cuts every episode, from its start, into segments of n steps; the last may be shorter
-and is scored by the same formula. All numbers are float64. How certain each formula is: the
-supplement states the types and beta, not all of the formulas. Signed squares follow from the
-negative scores in its Table 2, and the softmax reading of Max from its word "scaling parameter".
-The other maxima are variants by name. `minimum` and `peak_end` are not the paper's: they are kinds
-of score that no method was made for.
+The delay n cuts every episode, from its start, into segments of n steps, or of at most n where
+their lengths are drawn. The last may be shorter and is scored by the same formula. All numbers are
+float64. How certain each formula is: the supplement states the types and beta, not all of the
+formulas. Signed squares follow from the negative scores in its Table 2, and the softmax reading of
+Max from its word "scaling parameter". The other maxima are variants by name. `minimum` and
+`peak_end` are not the paper's: they are kinds of score that no method was made for.
 
 All formulas in a table: docs/methods.md#composite-rewards.
 """
@@ -126,13 +126,16 @@ def composite(name: str, rewards: F64, beta: float, delay: int) -> float:
     return value
 
 
-def perfect_score(name: str, beta: float, delay: int, horizon: int, r_max: float) -> float:
+def perfect_score(
+    name: str, beta: float, delay: int, horizon: int, r_max: float, shortest: int | None = None
+) -> float:
     """What an agent that earns r_max at every step collects in an episode: the unit of scores
     (A.3; docs/methods.md#score).
 
     It is the composite reward of a full segment, horizon / delay times. That number of segments is
     not rounded where the delay does not divide the horizon, although the episode's shorter last
-    segment is scored: a maximum can then exceed a score of 1.
+    segment is scored: a maximum can then exceed a score of 1. Where lengths are drawn, it is the
+    mean composite reward over all lengths, horizon / mean length times.
 
     Args:
         name: one of `COMPOSITES`.
@@ -140,5 +143,8 @@ def perfect_score(name: str, beta: float, delay: int, horizon: int, r_max: float
         delay: n, the steps of a full segment.
         horizon: T, the steps of a full episode.
         r_max: the largest reward of one step, positive.
+        shortest: the least steps of a full segment, if they are drawn from there to `delay`.
     """
-    return horizon / delay * composite(name, np.full(delay, r_max, np.float64), beta, delay)
+    lengths = range(shortest or delay, delay + 1)
+    whole = [composite(name, np.full(m, r_max, np.float64), beta, delay) for m in lengths]
+    return horizon / (sum(lengths) / len(lengths)) * (sum(whole) / len(whole))

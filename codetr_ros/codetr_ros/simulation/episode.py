@@ -3,6 +3,7 @@
 Simulators and the evaluator share this code, so that a score means the same in both.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,22 +32,25 @@ class EpisodeRunner:
 
     Args:
         environment: the environment; this object steps it and nothing else may.
-        settings: composite, beta, delay and r_max.
+        settings: composite, beta, delay, r_max and seed.
+        name: whose episodes these are: lengths of segments are drawn by seed, name and episode.
 
     Raises:
         SettingsError: the delay exceeds the horizon.
     """
 
-    def __init__(self, environment: Environment, settings: Settings) -> None:
+    def __init__(self, environment: Environment, settings: Settings, name: str) -> None:
         check(settings, environment)
         self._environment = environment
-        self._settings = settings
+        self._settings = settings = settings.within(environment.horizon)
+        self._name = name
         self._perfect = perfect_score(
             settings.composite,
             settings.beta,
-            settings.delay,
+            settings.longest,
             environment.horizon,
             r_max(settings, environment),
+            settings.lengths.least,
         )
         self._rewards = np.zeros(environment.horizon, np.float64)
         self.terminated = False
@@ -54,7 +58,9 @@ class EpisodeRunner:
         self.observation: F32 = np.zeros(environment.observation_size, np.float32)
         self.length = 0
         self._first_step = 0  # of the present segment
-        self._due = 0  # length at which it is to be scored, unless the episode ends before
+        # lengths at which a segment is to be scored, unless the episode ends before
+        self._ends: Iterator[int] = iter(())
+        self._due = 0
         self._composite_return = 0.0
 
     @property
@@ -62,16 +68,21 @@ class EpisodeRunner:
         """Whether the episode has ended, so that `reset` is due."""
         return self.terminated or self.truncated
 
-    def reset(self, seed: int) -> None:
-        """Start another episode, from the start that `seed` determines."""
+    @property
+    def place(self) -> int:
+        """Steps of the present segment so far."""
+        return self.length - self._first_step
+
+    def reset(self, seed: int, number: int) -> None:
+        """Start episode `number`, from the start that `seed` determines."""
+        settings, horizon = self._settings, self._environment.horizon
         self.observation = self._environment.reset(seed)
         self.terminated = self.truncated = False
         self.length = self._first_step = 0
-        self._due = self._end_of_segment()
+        ends = settings.lengths.ends(settings.seed, self._name, number, horizon)
+        self._ends = iter(ends.tolist())
+        self._due = next(self._ends, horizon)
         self._composite_return = 0.0
-
-    def _end_of_segment(self) -> int:
-        return min(self._first_step + self._settings.delay, self._environment.horizon)
 
     def step(self, action: F32) -> tuple[float, Score | None]:
         """Take an action (A,) in [-1, 1].
@@ -94,10 +105,10 @@ class EpisodeRunner:
         self.truncated = ends and not self.terminated
         first, settings = self._first_step, self._settings
         segment = self._rewards[first : self.length]
-        value = composite(settings.composite, segment, settings.beta, settings.delay)
+        value = composite(settings.composite, segment, settings.beta, settings.longest)
         score = Score(first, len(segment), value)
         self._first_step = self.length
-        self._due = self._end_of_segment()
+        self._due = next(self._ends, self._environment.horizon)
         self._composite_return += score.value
         return reward, score
 

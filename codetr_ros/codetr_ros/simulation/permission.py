@@ -36,13 +36,15 @@ def check_policy(policy: Record, run: RunSpec, settings: Settings, receiver: str
     return policy
 
 
-def acting_policy(policy: Policy, environment: Environment, delay: int) -> ActingPolicy | None:
+def acting_policy(
+    policy: Policy, environment: Environment, settings: Settings
+) -> ActingPolicy | None:
     """The policy to act with in an environment; None for the uniformly random one.
 
     Args:
         policy: the record that the learner published.
         environment: where it is to act.
-        delay: steps n of a segment.
+        settings: of the run: the steps n of a segment.
 
     Raises:
         RecordError: the weights are of another architecture or for other segments, missing or not
@@ -52,7 +54,10 @@ def acting_policy(policy: Policy, environment: Environment, delay: int) -> Actin
         return None
     try:
         return ActingPolicy.from_record(
-            policy, environment.observation_size, environment.action_size, delay
+            policy,
+            environment.observation_size,
+            environment.action_size,
+            settings.within(environment.horizon).longest,
         )
     except NetworkError as error:
         raise RecordError(

@@ -46,7 +46,7 @@ class Source:
         self.counters: Counter[str] = Counter()
         self._run = run
         self._settings = settings
-        self._episode = EpisodeRunner(self.environment, settings)
+        self._episode = EpisodeRunner(self.environment, settings, name)
         self._chunk_steps = steps_of_chunks(self.environment)
         self._episodes = -1  # number of the present one
         self._sequence = 0  # of the next chunk
@@ -91,7 +91,7 @@ class Source:
             if self._episode.over:
                 self._episodes += 1
                 seeds = generator(self._settings.seed, 'reset', self.name, self._episodes)
-                self._episode.reset(int(seeds.integers(2**31)))
+                self._episode.reset(int(seeds.integers(2**31)), self._episodes)
             done, records = self._chunk(policy, acting, draws[taken:], taken, scores_before)
             taken += done
             yield records
@@ -128,7 +128,7 @@ class Source:
         t = 0
         while t < most and not episode.over:
             if acting is not None:
-                actions[t] = acting.act(episode.observation, draws[t], episode.length)
+                actions[t] = acting.act(episode.observation, draws[t], episode.place)
             rewards[t], score = episode.step(actions[t])
             t += 1
             observations[t] = episode.observation

@@ -165,7 +165,7 @@ def check(settings: Settings, task: Task | Environment) -> None:
     Raises:
         SettingsError: the delay exceeds the horizon, so that no segment would ever be whole.
     """
-    if settings.delay > task.horizon:
+    if settings.within(task.horizon).longest > task.horizon:
         raise SettingsError(
             f'delay = {settings.delay}: task {task.name!r} has a horizon of {task.horizon} '
             f'steps; choose a delay from 1 to {task.horizon}'

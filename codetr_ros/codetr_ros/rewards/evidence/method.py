@@ -81,7 +81,7 @@ class Evidence(Predictor):
 
     def _new_model(self) -> Model:
         settings = self._settings
-        link = links.make(settings.composite, settings.beta, settings.delay)
+        link = links.make(settings.composite, settings.beta, settings.longest)
         return Model(link, self._features.blocks)
 
     @property
@@ -292,7 +292,7 @@ class Evidence(Predictor):
         settings, features = self._settings, self._features
         check_state(f'reward method {self.name!r}', self.state(), state, RewardModelError)
         try:
-            self._model = saving.restored(state, features.blocks, settings.beta, settings.delay)
+            self._model = saving.restored(state, features.blocks, settings.beta, settings.longest)
         except ValueError as error:
             raise RewardModelError(f'state of method {self.name!r} refused: {error}') from None
         super().load_state(state)
