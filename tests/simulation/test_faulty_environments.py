@@ -73,6 +73,7 @@ def of_two_sizes(o, r, te, tr, i):
         (lambda o, r, te, tr, i: (o, r, te, i, {}), 'truncated is dict {}: return a bool'),
         (lambda o, r, te, tr, i: (o, r, 'no', tr, i), "terminated is str 'no': return a bool"),
         (lambda o, r, te, tr, i: (o, float('nan'), te, tr, i), 'reward is nan, it must be finite'),
+        (lambda o, r, te, tr, i: (o, -1e39, te, tr, i), r'reward is -1e\+39, .* as float32'),
         (
             lambda o, r, te, tr, i: (o * np.inf, r, te, tr, i),
             r'observation\[0\] is -?inf, it must',

@@ -241,7 +241,7 @@ def test_an_observation_beyond_float32_is_refused():
     with (
         registered(of_type) as name,
         np.errstate(over='ignore'),
-        pytest.raises(TaskError, match=r'reset: observation\[1\] is inf.* fit float32'),
+        pytest.raises(TaskError, match=r'reset: observation\[1\] is inf.* also as float32'),
     ):
         make(name).reset(0)
 

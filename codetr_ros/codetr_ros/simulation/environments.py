@@ -22,6 +22,9 @@ from codetr_ros.records import F32
 
 _log = logging.getLogger(__name__)
 
+LARGEST = float(np.finfo(np.float32).max)
+"""The largest reward or observation: records hold them in float32."""
+
 
 class TaskError(ValueError):
     """A task that is unknown, cannot be used or misbehaves: names task, field and remedy."""
@@ -116,7 +119,7 @@ class Environment(ABC):
         """
         self._steps += 1
         observation, reward, terminated, self.truncated = self._step(self._within_bounds(action))
-        if not math.isfinite(reward):
+        if not -LARGEST <= reward <= LARGEST:  # not a number neither
             raise TaskError(self._not_finite('reward', reward))
         self._check(observation)
         return observation, reward, terminated
@@ -153,9 +156,9 @@ class Environment(ABC):
 
     def _not_finite(self, field: str, value: float) -> str:
         return (
-            f'task {self.name!r}, {self._call()}: {field} is {value}, it must be finite, and '
-            'observations fit float32 (up to 3.4e38): the simulation has diverged, or the '
-            'environment is at fault'
+            f'task {self.name!r}, {self._call()}: {field} is {value}, it must be finite, also as '
+            f'float32 (at most {LARGEST:.2g}): the simulation has diverged, or the environment '
+            'is at fault'
         )
 
     @abstractmethod
@@ -184,7 +187,7 @@ def _check_sizes(task: Task, observation_size: int, action_size: int) -> None:
 
 def _check_bounds(task: Task, field: str, bounds: NDArray[np.floating[Any]]) -> None:
     """Refuse bounds of actions that are none: infinite, or the largest number of a type."""
-    largest = min(float(np.finfo(bounds.dtype).max), float(np.finfo(np.float32).max))
+    largest = min(float(np.finfo(bounds.dtype).max), LARGEST)
     # not a number fails the comparison too
     if not (np.abs(bounds) < largest).all():
         raise TaskError(
