@@ -126,6 +126,20 @@ def test_a_gpu_that_is_not_there_is_refused_before_a_node_starts(
 
 
 @pytest.mark.slow
+def test_a_benchmark_of_a_task_that_no_run_can_have_is_refused_before_its_folder_is_made(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    lists = 'methods: [none]\ncomposites: [sum]\ndelays: [5]\nseeds: [0, 1]\nsteps: 300\n'
+    spec = Path('../spec.yaml')
+    spec.write_text(f'tasks: [Ant-v4, CartPole-v1]\n{lists}')
+
+    assert cli.main(['benchmark', 'run', str(spec), '--out', 'made']) == 2
+
+    assert 'its action space is Discrete(2)' in capsys.readouterr().err
+    assert list(Path.cwd().iterdir()) == []
+
+
+@pytest.mark.slow
 @pytest.mark.usefixtures('built')
 def test_a_task_that_only_this_process_knows_is_refused_over_topics(
     capsys: pytest.CaptureFixture[str],

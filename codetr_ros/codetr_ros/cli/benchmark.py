@@ -1,7 +1,8 @@
 """`codetr benchmark`: do many runs under one protocol, and make a table of them."""
 
 import dataclasses
-from collections.abc import Sequence
+import os
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,6 +10,7 @@ import tyro
 
 from codetr_ros.cli import FAILED, INTERRUPTED, refuse
 from codetr_ros.cli.terminal import parse_arguments
+from codetr_ros.config import Settings
 from codetr_ros.processes.supervise import Interrupts
 
 
@@ -82,16 +84,33 @@ def main(arguments: Sequence[str]) -> int:
     return _run(given) if isinstance(given, Run) else _report(given)
 
 
+def _try_out(runs: Iterable[Settings]) -> None:
+    """Try out what these runs need, each task and device once.
+
+    Raises:
+        TryoutError: no run with one of them can be done.
+    """
+    from codetr_ros.cli import tryout
+
+    wanted = {(run.task, run.device, run.reward_device): run for run in runs}
+    for settings in wanted.values():
+        tryout.apart(settings, os.environ)
+
+
 def _run(given: Run) -> int:
     from codetr_ros.benchmark import run, spec
+    from codetr_ros.cli.tryout import TryoutError
 
     if given.workers < 1:
         return refuse(f'--workers {given.workers}: at least 1')
     path, out = Path(given.spec), Path(given.out)
     with Interrupts() as interrupts:
         try:
+            loaded = spec.load(path)
+            if given.ray is None:  # the machines of a cluster may have what this one lacks
+                _try_out(cell.settings for cell in loaded.cells)
             failed = run.run(
-                spec.load(path),
+                loaded,
                 path,
                 out,
                 given.workers,
@@ -99,7 +118,7 @@ def _run(given: Run) -> int:
                 given.retry_failed,
                 lambda: interrupts.count > 0,
             )
-        except spec.BenchmarkError as error:
+        except (spec.BenchmarkError, TryoutError) as error:
             return refuse(str(error))
     if interrupts.count:
         print('stopped: what has ended is kept; the same command goes on')

@@ -12,7 +12,7 @@ from rich.table import Table
 from codetr_ros.cli import refuse
 from codetr_ros.cli.terminal import console, parse_arguments
 from codetr_ros.config import Settings, SettingsError
-from codetr_ros.records import EpisodeResult, Policy
+from codetr_ros.records import EpisodeResult, Policy, RecordError
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.folder import RunFolderError
 from codetr_ros.runs.numbers import number
@@ -59,12 +59,21 @@ def main(arguments: Sequence[str]) -> int:
 
     from codetr_ros.learners.base import LearnerError
     from codetr_ros.runs.checkpoints import CheckpointError
+    from codetr_ros.simulation.composite import CompositeError
     from codetr_ros.simulation.tasks import TaskError
 
     try:
         policy = newest_policy(folder, settings)
         results = evaluate(policy, settings)
-    except (RunFolderError, CheckpointError, LearnerError, TaskError) as error:
+    except (
+        RunFolderError,
+        CheckpointError,
+        LearnerError,
+        TaskError,
+        SettingsError,
+        RecordError,
+        CompositeError,
+    ) as error:
         return refuse(str(error))
     shown = console(tables=True)
     shown.print(
