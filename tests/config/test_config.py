@@ -160,7 +160,7 @@ def test_the_canonical_form_gives_the_same_settings_and_hash() -> None:
 
 
 def test_settings_of_a_run_that_are_not_settings_are_refused_with_their_source() -> None:
-    with pytest.raises(SettingsError, match='node learner: the settings are not JSON'):
+    with pytest.raises(SettingsError, match='node learner: the text of the settings is not JSON'):
         config.from_canonical('{', 'node learner')
     with pytest.raises(SettingsError, match='node learner: delay = 0'):
         config.from_canonical('{"delay": 0}', 'node learner')

@@ -1,5 +1,6 @@
 """The order of the library's folders, as pyproject.toml states it, holds over every import."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -35,3 +36,21 @@ def test_learning_imports_without_ros(tmp_path):
         'import codetr_ros.cli\n'
     )
     subprocess.run([sys.executable, '-c', program], check=True, cwd=tmp_path, timeout=120)
+
+
+# what is read there was written by the same program a moment before, or belongs to the package
+OWN_TEXTS = {
+    'bags/info.py': 'of what json.dumps has just made',
+    'bags/topics.py': 'of a file of this package',
+    'runs/checkpoints.py': 'of what json.dumps has just made',
+}
+
+
+def test_yaml_and_json_from_outside_are_read_by_the_one_reader_with_limits():
+    reads = re.compile(r'\byaml\.(safe_)?(load|parse|scan|compose)|\bjson\.loads?\(')
+    found = {
+        str(path.relative_to(LIBRARY))
+        for path in LIBRARY.rglob('*.py')
+        if reads.search(path.read_text())
+    }
+    assert found == {'system/parsing.py', *OWN_TEXTS}

@@ -12,14 +12,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
 from mcap.writer import CompressionType, Writer
 
 from codetr_ros.bags.definitions import bundled_text
-from codetr_ros.bags.metadata import METADATA, BagFile, load_yaml, render
+from codetr_ros.bags.metadata import METADATA, BagFile, render
 from codetr_ros.bags.raw import LIBRARY, Channel, RawMessage
 from codetr_ros.bags.writer import CHUNK_BYTES
 from codetr_ros.system.files import atomic_write, sync_folder
+from codetr_ros.system.parsing import ParseError, parse_yaml
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class _Topic:
 
     def qos(self) -> list[dict[str, Any]]:
         try:
-            profiles = load_yaml(self.channel.qos)
-        except (yaml.YAMLError, ValueError, RecursionError):  # ValueError: a bad date or number
+            profiles = parse_yaml(self.channel.qos, unique=False)
+        except ParseError:
             return []
         listed = isinstance(profiles, list) and all(isinstance(one, dict) for one in profiles)
         return profiles if listed else []

@@ -8,11 +8,10 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path, PurePath
 
-import yaml
-
 from codetr_ros.bags import metadata
 from codetr_ros.bags.errors import BagError, Damage, Place
 from codetr_ros.bags.metadata import METADATA
+from codetr_ros.system.parsing import brief
 
 _LFS_POINTER = b'version https://git-lfs'
 STORAGES = ('.mcap', '.db3')
@@ -46,9 +45,9 @@ def listed_files(folder: Path) -> list[str]:
         return []
     except OSError as error:
         raise BagError(f'{path} cannot be read: {error.strerror}') from error
-    except (yaml.YAMLError, ValueError, LookupError, TypeError, RecursionError) as error:
+    except (ValueError, LookupError, TypeError) as error:
         raise BagError(
-            f'{path} is damaged ({str(error).splitlines()[0]}). The messages do not need it: '
+            f'{path} is damaged ({brief(error)}). The messages do not need it: '
             'remove it, or make a new one with `codetr bag recover`'
         ) from error
 

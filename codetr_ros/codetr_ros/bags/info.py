@@ -18,6 +18,7 @@ from codetr_ros.records import (
     TaskSpec,
     Transitions,
 )
+from codetr_ros.system.parsing import ParseError, parse_json
 
 SETTINGS = ('task', 'composite', 'delay', 'method', 'steps', 'seed', 'simulators', 'envs')
 """The settings that are shown."""
@@ -110,8 +111,8 @@ class RunCounts:
 
     def _settings(self, record: RunSpec) -> None:
         try:
-            settings = json.loads(record.settings)
-        except ValueError:
+            settings = parse_json(record.settings)
+        except ParseError:
             return  # `verify` reports it
         if isinstance(settings, dict):
             self.settings = {name: _plain(settings[name]) for name in SETTINGS if name in settings}

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import yaml
 
 from codetr_ros.bags.names import full_name, full_type_name
+from codetr_ros.system.parsing import read_yaml
 
 METADATA = 'metadata.yaml'
 VERSION = 9
@@ -17,30 +18,15 @@ VERSION = 9
 LONGEST = 16 << 20
 """The most bytes of the file."""
 
-_LOADER: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)  # the same in C, ten times as fast
-
-
-def load_yaml(text: bytes | str) -> Any:
-    """Read YAML from a bag.
-
-    Raises:
-        yaml.YAMLError: the text is not YAML.
-    """
-    return yaml.load(text, _LOADER)
-
 
 def read(folder: Path) -> Any:
     """The content of a bag's metadata.
 
     Raises:
         OSError: it cannot be read, or there is none.
-        ValueError: it is too long.
-        yaml.YAMLError, UnicodeDecodeError, LookupError, TypeError, RecursionError: it is damaged.
+        ParseError, LookupError, TypeError: it is damaged.
     """
-    path = folder / METADATA
-    if (size := path.stat().st_size) > LONGEST:
-        raise ValueError(f'it has {size} bytes, at most {LONGEST} are read')
-    return load_yaml(path.read_bytes())['rosbag2_bagfile_information']
+    return read_yaml(folder / METADATA, LONGEST, unique=False)['rosbag2_bagfile_information']
 
 
 class DescribedTopic(Protocol):
@@ -153,15 +139,7 @@ def check(
         return
     try:
         yield from _contradictions(read(folder), topics, files)
-    except (
-        OSError,
-        yaml.YAMLError,
-        LookupError,
-        TypeError,
-        ValueError,
-        RecursionError,
-        AttributeError,
-    ) as error:
+    except (OSError, LookupError, TypeError, ValueError, AttributeError) as error:
         yield f'{METADATA} cannot be read: {str(error) or type(error).__name__}'
 
 

@@ -1,7 +1,6 @@
 """Checks of one run in a bag, record by record."""
 
 import hashlib
-import json
 from collections.abc import Callable
 from typing import Any
 
@@ -26,6 +25,7 @@ from codetr_ros.records import (
     TrueRewards,
     describe,
 )
+from codetr_ros.system.parsing import parse_json
 
 
 class RunChecks:
@@ -110,7 +110,7 @@ class RunChecks:
                 'run', place, f'protocol {record.protocol_version}, this is {PROTOCOL_VERSION}'
             )
         try:
-            delay = json.loads(record.settings)['delay']
+            delay = parse_json(record.settings)['delay']
             Lengths.of(delay)  # refuses what is no delay
             self._cuts = Cuts(delay, record.seed)
         except (ValueError, LookupError, TypeError) as error:

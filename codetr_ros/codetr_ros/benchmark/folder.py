@@ -33,7 +33,9 @@ from codetr_ros.config import flatten
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import run_summary
 from codetr_ros.runs.run_summary import RunSummary
+from codetr_ros.system import parsing
 from codetr_ros.system.files import atomic_write
+from codetr_ros.system.parsing import ParseError, read_yaml
 from codetr_ros.system.versions import versions
 
 SPEC = 'spec.yaml'
@@ -64,8 +66,8 @@ def read_summary(run: Path) -> RunSummary | None:
 def read_json(path: Path) -> dict[str, Any] | None:
     """The JSON object in a file; None if there is no file or no such object in it."""
     try:
-        data = json.loads(path.read_text())
-    except (OSError, ValueError):
+        data = parsing.read_json(path)
+    except (OSError, ParseError):
         return None
     return data if isinstance(data, dict) else None
 
@@ -193,9 +195,9 @@ class Folder:
         """The settings in which the cell differs from that in the folder."""
         path = self.settings(cell.name)
         try:
-            there = yaml.safe_load(path.read_text())
-        except (OSError, yaml.YAMLError) as error:
-            return f'{path} cannot be read: {error}'
+            there = read_yaml(path)
+        except (OSError, ParseError) as error:
+            return f'{path}: {error}'
         before = dict(flatten(there if isinstance(there, dict) else {}))
         now = dict(flatten(cell.settings.model_dump(mode='json')))
         names = [name for name in {**before, **now} if before.get(name) != now.get(name)]

@@ -5,11 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from codetr_ros.benchmark.folder import Folder, State, read_json
 from codetr_ros.benchmark.spec import BenchmarkError
 from codetr_ros.runs.run_summary import Evaluation, RewardRecovery, RunSummary
+from codetr_ros.system.parsing import ParseError, read_yaml
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,9 +88,14 @@ def _read(folder: Folder) -> Iterator[Result]:
         state = folder.state(name, row['settings_hash'])
         ending = read_json(folder.ending(name)) or {}
         try:
-            settings = yaml.safe_load(folder.settings(name).read_text())
-        except (OSError, yaml.YAMLError) as error:
-            raise BenchmarkError(f'{folder.settings(name)} cannot be read: {error}') from None
+            settings = read_yaml(folder.settings(name))
+        except (OSError, ParseError) as error:
+            raise BenchmarkError(f'{folder.settings(name)}: {error}') from None
+        if not isinstance(settings, dict):
+            raise BenchmarkError(
+                f'{folder.settings(name)} must hold a mapping of settings, not '
+                f'{type(settings).__name__}'
+            )
         failed = state == 'failed'
         yield Result(
             cell=name,

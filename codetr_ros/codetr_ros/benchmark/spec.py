@@ -27,6 +27,7 @@ from pydantic import Field, ValidationError, field_validator
 from codetr_ros import config
 from codetr_ros.config import Composite, Delay, Group, Method, Settings, SettingsError
 from codetr_ros.simulation import tasks
+from codetr_ros.system.parsing import ParseError, read_yaml
 
 DEFAULT_BASE = 'quick'
 _AXES = {
@@ -119,11 +120,11 @@ def load(path: Path) -> Spec:
             does not exist. Names key, value and file.
     """
     try:
-        data = config.read_yaml(path.read_text())
+        data = read_yaml(path)
     except OSError as error:
         raise BenchmarkError(f'spec {path} cannot be read: {error.strerror}') from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise BenchmarkError(f'spec {path} is not YAML: {error}') from None
+    except ParseError as error:
+        raise BenchmarkError(f'spec {path} {error}') from None
     if not isinstance(data, Mapping):
         raise BenchmarkError(
             f'spec {path} must hold a mapping with the keys {", ".join(_Keys.model_fields)}, '

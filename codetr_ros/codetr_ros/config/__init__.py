@@ -9,7 +9,6 @@ from codetr_ros.config.base import (
     flatten,
     in_words,
     names,
-    read_yaml,
     validate,
 )
 from codetr_ros.config.delays import Delay, Lengths, delay_in_words
@@ -68,6 +67,5 @@ __all__ = [
     'names',
     'nearest',
     'parse',
-    'read_yaml',
     'validate',
 ]

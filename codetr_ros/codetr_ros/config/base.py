@@ -1,15 +1,13 @@
 """The base of all settings: how they are validated, and what a refusal names."""
 
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, TypeVar
 
-import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from codetr_ros.system.parsing import shortened
 from codetr_ros.system.similar import did_you_mean
 
-_SEXAGESIMAL = re.compile(r'[-+]?[0-9][0-9_]*(:[0-9]+)+(\.[0-9_]*)?')
 _IN_WORDS: dict[str, str] = {}
 
 
@@ -40,25 +38,6 @@ class Group(BaseModel):
     )
 
 
-class _Loader(yaml.SafeLoader):
-    """Reads `10:50` as text, where YAML 1.1 has a number of base 60."""
-
-    def resolve(self, kind: Any, value: Any, implicit: Any) -> Any:
-        """The tag of a node."""
-        if kind is yaml.ScalarNode and implicit[0] and _SEXAGESIMAL.fullmatch(value):
-            return 'tag:yaml.org,2002:str'
-        return super().resolve(kind, value, implicit)  # type: ignore[no-untyped-call]
-
-
-def read_yaml(text: str) -> Any:
-    """What is in YAML that people write.
-
-    Raises:
-        yaml.YAMLError: it is not YAML.
-    """
-    return yaml.load(text, _Loader)
-
-
 def flatten(data: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
     """The values of nested mappings, each with its dotted name."""
     for key, value in data.items():
@@ -68,6 +47,7 @@ def flatten(data: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, An
             yield f'{prefix}{key}', value
 
 
+_LINES = 20  # of a refusal
 _G = TypeVar('_G', bound=Group)
 
 
@@ -108,14 +88,17 @@ def explain(error: ValidationError, source: str, known: Iterable[str] = ()) -> s
     """
     there = list(known)
     lines = []
-    for e in error.errors():
+    errors = error.errors()
+    for e in errors[:_LINES]:
         name = '.'.join(str(part) for part in e['loc']) or 'settings'
-        value = '' if isinstance(e['input'], Mapping) else f' = {e["input"]!r}'
+        value = '' if isinstance(e['input'], Mapping) else f' = {shortened(repr(e["input"]))}'
         if e['type'] == 'extra_forbidden':
             reason = f'there is no such setting{did_you_mean(name, there)}'
         elif words := _IN_WORDS.get(e.get('ctx', {}).get('pattern', '')):
             reason = f'must be {words}'
         else:
             reason = e['msg']
-        lines.append(f'{source}: {name}{value}: {reason}')
+        lines.append(f'{source}: {shortened(name)}{value}: {reason}')
+    if len(errors) > _LINES:
+        lines.append(f'{source}: and {len(errors) - _LINES} more')
     return '\n'.join(lines)

@@ -1,15 +1,13 @@
 """Settings from a preset, a YAML file, or the JSON of a run."""
 
-import json
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from codetr_ros.config.base import SettingsError, flatten, read_yaml, validate
+from codetr_ros.config.base import SettingsError, flatten, validate
 from codetr_ros.config.run import Settings
+from codetr_ros.system.parsing import ParseError, parse_json, parse_yaml, read_yaml
 
 PRESETS = ('quick', 'cpu', 'paper')
 
@@ -34,19 +32,21 @@ def load(name: str) -> Settings:
         SettingsError: there is no such preset or file, it is not YAML, or a setting is refused.
     """
     if name in PRESETS:
-        text = resources.files('codetr_ros.config.presets').joinpath(f'{name}.yaml').read_text()
         source = f'preset {name}'
+        preset = resources.files('codetr_ros.config.presets').joinpath(f'{name}.yaml')
+        data = parse_yaml(preset.read_bytes())
     else:
-        path = Path(name)
+        path, source = Path(name), name
         if not path.is_file():
             raise SettingsError(
                 f'config {name!r} is neither a preset ({", ".join(PRESETS)}) nor a file'
             )
-        text, source = path.read_text(), str(path)
-    try:
-        data = read_yaml(text)
-    except yaml.YAMLError as error:
-        raise SettingsError(f'{source} is not YAML: {error}') from None
+        try:
+            data = read_yaml(path)
+        except OSError as error:
+            raise SettingsError(f'config {path} cannot be read: {error.strerror}') from None
+        except ParseError as error:
+            raise SettingsError(f'{path} {error}') from None
     if not isinstance(data, Mapping):
         raise SettingsError(f'{source} must hold a mapping of settings, not {type(data).__name__}')
     return parse(data, source)
@@ -79,7 +79,7 @@ def from_canonical(text: str, source: str) -> Settings:
         SettingsError: it is not JSON, or a setting is refused.
     """
     try:
-        data = json.loads(text)
-    except ValueError as error:
-        raise SettingsError(f'{source}: the settings are not JSON: {error}') from None
+        data = parse_json(text)
+    except ParseError as error:
+        raise SettingsError(f'{source}: the text of the settings {error}') from None
     return parse(data, source)

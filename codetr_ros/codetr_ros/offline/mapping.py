@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import yaml
 from pydantic import Field, model_validator
 
 from codetr_ros.config import Group, SettingsError, in_words, validate
@@ -13,6 +12,7 @@ from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.message_fields import FieldPath, Topic, field
 from codetr_ros.offline.score_rules import Score
 from codetr_ros.records import F64
+from codetr_ros.system.parsing import ParseError, read_yaml
 
 
 class Values(Group):
@@ -147,11 +147,11 @@ def load(path: Path) -> Mapping:
         SettingsError: it cannot be read, is not YAML, or has a wrong key or value.
     """
     try:
-        data = yaml.safe_load(path.read_text())
+        data = read_yaml(path)
     except OSError as error:
         raise SettingsError(f'mapping {path} cannot be read: {error.strerror}') from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise SettingsError(f'mapping {path} is not YAML: {error}') from None
+    except ParseError as error:
+        raise SettingsError(f'mapping {path} {error}') from None
     if not isinstance(data, AnyMapping):
         raise SettingsError(f'mapping {path} must hold a mapping, not {type(data).__name__}')
     return validate(Mapping, data, f'mapping {path}')

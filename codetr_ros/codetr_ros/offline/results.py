@@ -20,6 +20,7 @@ from codetr_ros.runs import checkpoints
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.folder import RunFolderError
 from codetr_ros.system.files import atomic_write
+from codetr_ros.system.parsing import ParseError, read_json
 
 DIGEST = 'reward_model_sha256'
 
@@ -55,8 +56,8 @@ def live_digest(bag: Bag) -> str | None:
     if not path.is_file():
         return None
     try:
-        summary = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+        summary = read_json(path)
+    except (OSError, ParseError) as error:
         raise RunFolderError(
             f'{path} cannot be read as JSON ({error}): move the bag elsewhere'
         ) from None

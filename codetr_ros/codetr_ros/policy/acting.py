@@ -4,7 +4,6 @@ The record carries a JSON description and safetensors bytes, never a pickle.
 Shapes: O = observation size, A = action size.
 """
 
-import json
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from codetr_ros.policy.actor import (
     standardise,
 )
 from codetr_ros.records import F32, Policy
+from codetr_ros.system.parsing import parse_json
 
 MAX_LAYERS = 8
 MAX_WIDTH = 65_536
@@ -147,7 +147,7 @@ def _own(tensor: Tensor) -> Tensor:
 def _parse(network: str, name: str) -> dict[str, Any]:
     """The content of a description."""
     try:
-        description = json.loads(network)
+        description = parse_json(network)
         if not isinstance(description, dict):
             raise ValueError
         if not {'hidden', 'segment_steps'} <= description.keys():

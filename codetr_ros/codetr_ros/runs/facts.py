@@ -1,6 +1,5 @@
 """The facts that a run writes about itself: fields with descriptions, checked on reading."""
 
-import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
 from codetr_ros.config import explain
 from codetr_ros.runs.folder import RunFolderError
+from codetr_ros.system.parsing import ParseError, read_json
 
 
 def finite(value: Any) -> Any:
@@ -56,13 +56,13 @@ def read(kind: type[_F], path: Path, what: str, remedy: str) -> _F:
             another type; names the file and the field.
     """
     try:
-        data = json.loads(path.read_text())
+        data = read_json(path)
     except OSError as error:
         raise RunFolderError(
             f'{what} {path} cannot be read ({error.strerror}): {remedy}'
         ) from None
-    except ValueError as error:
-        raise RunFolderError(f'{what} {path} is not JSON ({error}): {remedy}') from None
+    except ParseError as error:
+        raise RunFolderError(f'{what} {path} {error}: {remedy}') from None
     if not isinstance(data, dict):
         raise RunFolderError(f'{what} {path} holds {type(data).__name__}, not an object: {remedy}')
     try:
