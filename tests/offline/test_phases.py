@@ -55,6 +55,24 @@ def test_labels_of_what_the_learner_drew_are_made_again_from_the_bag(tmp_path):
     assert verify(bag).sound
 
 
+@pytest.mark.parametrize(
+    'changes',
+    [{}, pytest.param({'evidence__link': 'choose'}, marks=pytest.mark.slow)],
+    ids=['known', 'choose'],
+)
+def test_a_regression_on_maxima_is_fitted_again_from_the_bag(tmp_path, changes):
+    """Each fit goes on from the one before: all of them must be done again."""
+    settings = tiny(steps=600, evaluate_every=0, method='evidence', composite='max', **changes)
+    records: list[Record] = []
+    reports = in_process.run(settings, 'calls', observe=records.append)
+
+    made = fit(write(tmp_path / 'bag', records), tmp_path / 'out')
+
+    assert made[DIGEST] == reports['reward'].reward_model_sha256
+    labels = sum(len(r.lengths) for r in records if isinstance(r, StepRewards))
+    assert made['recorded_labels'] == {'same': labels, 'other': 0}
+
+
 @pytest.mark.slow
 def test_topics_may_have_been_recorded_in_another_order(a_run, tmp_path):
     """As by a recorder that hears the commits before the last scores, and some steps later."""

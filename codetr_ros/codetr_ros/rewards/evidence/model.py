@@ -25,7 +25,7 @@ from codetr_ros.rewards.evidence.sample import Sample
 from codetr_ros.rewards.evidence.scales import Evidence, Linear
 from codetr_ros.rewards.evidence.verdicts import Verdicts
 
-ROUNDS = (7, 3)
+ROUNDS = (7, 1)
 """Gauss-Newton rounds of a first fit, after its first one, and of later fits."""
 ITERATIONS = (40, 10)
 """Of the search for scales: at first, later."""
