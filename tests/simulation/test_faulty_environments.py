@@ -162,7 +162,7 @@ def needs_an_argument(robot):
     ('entry_point', 'message'),
     [
         (raising(FileNotFoundError('model.xml')), 'raised FileNotFoundError: model.xml .test_fau'),
-        (needs_an_argument, r"raised TypeError: .*'robot'.*register it with the `kwargs`"),
+        (needs_an_argument, r"raised TypeError: .*'robot'.*kwargs \({}\)\. .* with the `kwargs`"),
         (raising(SystemExit('no licence')), 'raised SystemExit: no licence'),
         (lambda: None, 'raised TypeError: The environment must inherit from the gymnasium.Env'),
         (lambda: TimesTen(gymnasium.Env()), '`observation_space` and `action_space`'),
@@ -214,7 +214,15 @@ def test_a_module_whose_code_raises_is_refused_by_its_name(tmp_path, monkeypatch
     (tmp_path / 'broken_tasks.py').write_text('1 / 0\n')
     monkeypatch.setattr(sys, 'path', [*sys.path, str(tmp_path)])
     message = (
-        "task 'broken_tasks:X-v0': module 'broken_tasks' cannot be imported: ZeroDivisionError"
+        r"task 'broken_tasks:X-v0': module 'broken_tasks' cannot be imported: ZeroDivisionError: "
+        r'.* \(broken_tasks.py, line 1, in <module>\). Install it'
     )
     with pytest.raises(TaskError, match=message):
         make('broken_tasks:X-v0')
+
+
+def test_a_module_that_is_not_there_is_refused_without_a_place_in_the_library():
+    with pytest.raises(
+        TaskError, match=r"No module named 'no_such_robot'\. Install it, start from"
+    ):
+        make('no_such_robot:X-v0')

@@ -12,9 +12,7 @@ to do.
 import dataclasses
 import logging
 import math
-import traceback
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,13 +20,12 @@ from numpy.typing import NDArray
 
 from codetr_ros.records import F32
 from codetr_ros.simulation.environments import Environment, Task, TaskError, flat, quiet
+from codetr_ros.simulation.faults import FAULTS, described, in_words
 
 _log = logging.getLogger(__name__)
 
 _ONE_STEP = ('gymnasium.core', 'gymnasium.wrappers.common')
 """Modules whose wrappers take one step of the inner environment in each of theirs."""
-_FAULTS = (Exception, SystemExit)
-"""Errors that an environment's code may raise: a program that ends itself is one of them."""
 
 
 class GymnasiumEnvironment(Environment):
@@ -45,9 +42,9 @@ class GymnasiumEnvironment(Environment):
         self._env = _made(task)
         try:
             observation, action = self._env.observation_space, self._env.action_space
-        except _FAULTS as error:
+        except FAULTS as error:
             raise TaskError(
-                f'task {task.name!r}: its spaces cannot be read: {_in_words(error)}: set '
+                f'task {task.name!r}: its spaces cannot be read: {in_words(error)}: set '
                 '`observation_space` and `action_space` in the constructor'
             ) from error
         _check_space(task, 'observation', observation)
@@ -59,15 +56,15 @@ class GymnasiumEnvironment(Environment):
         self._lent: Any = None  # the generator that the environment was given, if it had none
 
     def _reset(self, seed: int) -> F32:
-        self._seed(seed)
         try:
+            self._seed(seed)
             answer = self._env.reset(seed=seed)
-        except _FAULTS as error:
+        except FAULTS as error:
             raise self._raised(
                 error, 'reset must take `seed` and `options` by name, as gymnasium.Env has it'
             ) from error
         if not isinstance(answer, tuple) or len(answer) != 2:
-            raise self._fault(f'it returned {_described(answer)}: return (observation, info)')
+            raise self._fault(f'it returned {described(answer)}: return (observation, info)')
         return self._numbers(answer[0])
 
     def _seed(self, seed: int) -> None:
@@ -88,11 +85,11 @@ class GymnasiumEnvironment(Environment):
     def _step(self, action: NDArray[Any]) -> tuple[F32, float, bool, bool]:
         try:
             answer = self._env.step(action.reshape(self._shape))
-        except _FAULTS as error:
+        except FAULTS as error:
             raise self._raised(error, 'step must take every action of its action space') from error
         if not isinstance(answer, tuple) or len(answer) != 5:
             raise self._fault(
-                f'it returned {_described(answer)}: return (observation, reward, terminated, '
+                f'it returned {described(answer)}: return (observation, reward, terminated, '
                 'truncated, info), as Gymnasium has it since 0.26'
             )
         observation, reward, terminated, truncated, _ = answer
@@ -109,7 +106,7 @@ class GymnasiumEnvironment(Environment):
             return flat(observation)
         except (TypeError, ValueError) as error:
             raise self._fault(
-                f'the observation is {_described(observation)}, no array of numbers ({error}): '
+                f'the observation is {described(observation)}, no array of numbers ({error}): '
                 'return what its observation space announces'
             ) from error
 
@@ -119,10 +116,10 @@ class GymnasiumEnvironment(Environment):
             return float(reward)
         try:
             number = np.asarray(reward)
-        except _FAULTS as error:
+        except FAULTS as error:
             raise self._raised(error, 'return the reward as a float') from error
         if number.ndim or number.dtype.kind not in 'fiub':
-            raise self._fault(f'the reward is {_described(reward)}: return one number, as a float')
+            raise self._fault(f'the reward is {described(reward)}: return one number, as a float')
         return float(number)
 
     def _flag(self, field: str, value: Any) -> bool:
@@ -133,13 +130,13 @@ class GymnasiumEnvironment(Environment):
             return bool(value)
         if isinstance(value, np.ndarray) and value.ndim == 0 and value.dtype.kind == 'b':
             return bool(value)
-        raise self._fault(f'{field} is {_described(value)}: return a bool')
+        raise self._fault(f'{field} is {described(value)}: return a bool')
 
     def _fault(self, what: str) -> TaskError:
         return TaskError(f'task {self.name!r}, {self._call()}: {what}')
 
     def _raised(self, error: BaseException, remedy: str) -> TaskError:
-        return self._fault(f'the environment raised {_in_words(error)}. Mend it there; {remedy}')
+        return self._fault(f'the environment raised {in_words(error)}. Mend it there; {remedy}')
 
     def close(self) -> None:
         """Free what the environment holds. An error in that costs nothing that was learnt: it is
@@ -147,8 +144,8 @@ class GymnasiumEnvironment(Environment):
         """
         try:
             self._env.close()
-        except _FAULTS as error:
-            _log.warning('task %r, close: the environment raised %s', self.name, _in_words(error))
+        except FAULTS as error:
+            _log.warning('task %r, close: the environment raised %s', self.name, in_words(error))
 
 
 def _made(task: Task) -> Any:
@@ -168,9 +165,9 @@ def _made(task: Task) -> Any:
             f'task {task.name!r} cannot be made: {error}. '
             'Install what it needs, or choose a task that `codetr tasks` lists'
         ) from error
-    except _FAULTS as error:
+    except FAULTS as error:
         raise TaskError(
-            f'task {task.name!r} cannot be made: its constructor raised {_in_words(error)}. '
+            f'task {task.name!r} cannot be made: its constructor raised {in_words(error)}. '
             f'`gymnasium.make({task.environment_id!r})` must work without further arguments: mend '
             'the environment, or register it with the `kwargs` that it needs'
         ) from error
@@ -213,9 +210,10 @@ def _layers(env: Any) -> Iterator[Any]:
 
 
 def _spaces(env: Any) -> list[Any]:
-    """All spaces of an environment and its wrappers, each once."""
-    spaces = [s for layer in _layers(env) for s in (layer.action_space, layer.observation_space)]
-    return list({id(space): space for space in spaces}.values())
+    """All spaces of an environment and its wrappers, each once. An inner one may lack them."""
+    names = ('action_space', 'observation_space')
+    spaces = [getattr(layer, name, None) for layer in _layers(env) for name in names]
+    return list({id(space): space for space in spaces if space is not None}.values())
 
 
 def _period(env: Any) -> float:
@@ -235,27 +233,3 @@ def _period(env: Any) -> float:
             return 0.0
     fps = (env.unwrapped.metadata or {}).get('render_fps')
     return 1 / fps if fps else 0.0
-
-
-def _described(answer: Any) -> str:
-    """An answer of an environment, for errors: its type, and its size or value."""
-    if isinstance(answer, tuple):
-        return f'{len(answer)} values'
-    shape = getattr(answer, 'shape', None)
-    if shape is not None:
-        return f'{type(answer).__name__} of shape {tuple(shape)}'
-    return f'{answer!r}' if answer is None else f'{type(answer).__name__} {repr(answer)[:60]}'
-
-
-def _in_words(error: BaseException) -> str:
-    """An error of somebody's code, and the place there that raised it."""
-    from gymnasium.envs import registration
-
-    frames = traceback.extract_tb(error.__traceback__)
-    callers = (str(Path(__file__).parent), registration.__file__)
-    theirs = [frame for frame in frames if not frame.filename.startswith(callers)]
-    # the innermost place that is no installed library's, for that is where it can be mended
-    own = [frame for frame in theirs if 'site-packages' not in Path(frame.filename).parts]
-    at = (own or theirs)[-1:]
-    place = ''.join(f' ({Path(f.filename).name}, line {f.lineno}, in {f.name})' for f in at)
-    return f'{type(error).__name__}: {error}{place}'

@@ -9,6 +9,7 @@ from typing import Any
 from codetr_ros.config import Settings, SettingsError
 from codetr_ros.simulation.control_suite import ControlSuiteEnvironment
 from codetr_ros.simulation.environments import Environment, Task, TaskError
+from codetr_ros.simulation.faults import FAULTS, in_words
 from codetr_ros.simulation.gymnasium_environment import GymnasiumEnvironment
 from codetr_ros.system import modules
 
@@ -128,11 +129,10 @@ def _import(name: str, module: str) -> None:
     """
     try:
         modules.load(module)
-    except (Exception, SystemExit) as error:
+    except FAULTS as error:
         raise TaskError(
-            f'task {name!r}: module {module!r} cannot be imported: {type(error).__name__}: '
-            f'{error}. Install it, start from the folder that holds it, or name that folder in '
-            'PYTHONPATH'
+            f'task {name!r}: module {module!r} cannot be imported: {in_words(error)}. '
+            'Install it, start from the folder that holds it, or name that folder in PYTHONPATH'
         ) from error
 
 
