@@ -72,6 +72,13 @@ def test_over_topics_and_in_process_end_with_the_same_weights(tmp_path, task, me
 
 
 @pytest.mark.slow
+def test_a_transformer_above_a_regression_is_the_same_over_topics(tmp_path):
+    settings = tiny(task=REACHER, method='codetr', codetr__base='evidence', delay=7)
+    topics, _ = train(settings, tmp_path / 'topics')
+    check_same(topics, by_calls(settings))
+
+
+@pytest.mark.slow
 def test_another_seed_pace_or_method_ends_with_other_weights():
     """What the equality above would miss if the digests were of something else."""
     changes = (

@@ -282,6 +282,29 @@ class TestCodetrOfRewardsAlone(TestCodetr):
     changes: ClassVar[dict[str, Any]] = {'codetr__label': 'rhat', 'codetr__head_scale': 'one'}
 
 
+class TestCodetrOnEvidence(TestCodetr):
+    changes: ClassVar[dict[str, Any]] = {'codetr__base': 'evidence'}
+
+    def test_scale_and_moments_stay_as_they_were_first_measured(self):
+        """The network's; the regression below looks at all that there is."""
+        made = self.trained(filled())
+        before = made.state()
+        made.prepare(linear_rewards.memory((24,), DELAY, seed=5))
+        after = made.state()
+        fitted = {name for name in before if name.startswith('base.')}
+        assert all(torch.equal(after[x], before[x]) for x in before.keys() - fitted)
+        assert not torch.equal(after['base.weights'], before['base.weights'])
+
+
+class TestCodetrOnEvidenceOfAKindOfScoreThatIsNotKnown(TestCodetrOnEvidence):
+    changes: ClassVar[dict[str, Any]] = {
+        'codetr__base': 'evidence',
+        'codetr__tokens': 'pair',
+        'codetr__label': 'rhat',
+        'evidence__link': 'choose',
+    }
+
+
 class TestRbt(LearnedContract):
     method = 'rbt'
 

@@ -86,6 +86,7 @@ def test_without_a_checkpoint_nothing_is_other_than_it_was(tmp_path):
     [
         ({'method': 'mlp'}, "has method = 'codetr', here 'mlp'"),
         ({'delay': 9}, 'has delay = 7, here 9'),
+        ({'codetr.base': 'evidence'}, "has codetr.base = 'none', here 'evidence'"),
         ({'codetr.layers': 2}, 'has codetr.layers = 1, here 2'),
         ({'codetr.label': 'rhat'}, "has codetr.label = 'product', here 'rhat'"),
         ({'reward_unit': 'raw'}, "has reward_unit = 'scaled', here 'raw'"),

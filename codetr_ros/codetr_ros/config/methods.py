@@ -77,6 +77,11 @@ class CodetrSettings(Group):
         'product',
         description='step reward: w_t * rhat_t, whose sum is the prediction, or rhat_t',
     )
+    base: Literal['none', 'evidence'] = Field(
+        'none',
+        description='what the transformer learns: scores, or only what the regression of method '
+        '`evidence` leaves of them; its rewards are then added as far as held-out scores ask for',
+    )
     labelling: Literal['segment', 'window'] = Field(
         'segment',
         description='label whole segments in one pass, or each step from the `window` steps '
@@ -106,11 +111,20 @@ class CodetrSettings(Group):
             raise ValueError(f'embedding={self.embedding} is not divisible by heads={self.heads}')
         return self
 
+    @model_validator(mode='after')
+    def _whole_segments_above_a_base(self) -> 'CodetrSettings':
+        if self.base != 'none' and self.labelling != 'segment':
+            raise ValueError(
+                f'base={self.base} labels whole segments, not windows: labelling={self.labelling} '
+                'must be segment'
+            )
+        return self
+
 
 class RbtSettings(Group):
     """The settings of RBT beyond the transformer, whose settings it shares with CoDeTr (`codetr`).
 
-    Of those, only CoDeTr uses `weights`, `label`, `context` and `attention_scope`.
+    Of those, only CoDeTr uses `weights`, `label`, `context`, `base` and `attention_scope`.
     """
 
     state_loss_weight: float = Field(

@@ -11,6 +11,7 @@ from codetr_ros.rewards.mil_lstm import MilLstm
 from codetr_ros.rewards.mlp import Mlp
 from codetr_ros.rewards.rbt import Rbt
 from codetr_ros.rewards.redistribution import LastStep, Ones, Random, TrueReward, Uniform
+from codetr_ros.rewards.residual import CodetrOnEvidence
 from codetr_ros.rewards.rrd import Rrd
 
 METHODS: dict[str, type[RewardMethod]] = {
@@ -46,6 +47,8 @@ def kind(settings: Settings) -> type[RewardMethod]:
             f'method = {settings.method!r}: there is no such reward method; '
             f'choose one of {", ".join(METHODS)}'
         )
+    if settings.method == Codetr.name and settings.codetr.base == 'evidence':
+        return CodetrOnEvidence
     return METHODS[settings.method]
 
 

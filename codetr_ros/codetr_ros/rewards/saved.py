@@ -137,7 +137,7 @@ def _differing(theirs: Settings, ours: Settings) -> list[tuple[str, object, obje
     if theirs.method != ours.method:
         return [('method', theirs.method, ours.method)]
     kind = registry.kind(ours)
-    groups = {getattr(kind, 'group', ''), ours.method}
+    groups = {getattr(kind, 'group', ''), getattr(kind, 'base_group', ''), ours.method}
     mine, saved = ours.flat(), theirs.flat()
     names = [*_SHARED]
     for name in mine:

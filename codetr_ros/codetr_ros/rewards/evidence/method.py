@@ -220,6 +220,20 @@ class Evidence(Predictor):
         steps[inside] = found.steps * factor
         return Uncertainty(steps, found.segments * factor)
 
+    @property
+    def model(self) -> Model:
+        """The fitted regression."""
+        return self._model
+
+    def mean(self, batch: SegmentBatch) -> F64:
+        """The posterior mean (N,) of segments' steps, in units of the level scale.
+
+        Raises:
+            RewardModelError: `prepare` was never called.
+        """
+        self._require_prepared()
+        return self._f(batch)
+
     def _f(self, batch: SegmentBatch) -> F64:
         """The posterior mean (N,) of segments' steps, in units of the level scale."""
         weights = self._model.posterior.mean

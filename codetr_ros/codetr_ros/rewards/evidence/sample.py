@@ -76,12 +76,12 @@ def chosen(ids: I64, most: int, seed: int) -> I64:
     age = ends - np.arange(len(ids))  # 1 for the newest of each source
     order = np.lexsort((ids, age))
     newest, older = order[: most // 2], order[most // 2 :]
-    kept = older[np.argsort(_scrambled(ids[older], seed), kind='stable')[: most - most // 2]]
+    kept = older[np.argsort(scrambled(ids[older], seed), kind='stable')[: most - most // 2]]
     some: I64 = ids[np.sort(np.concatenate([newest, kept]))]
     return some
 
 
-def _scrambled(ids: I64, seed: int) -> NDArray[np.uint64]:
+def scrambled(ids: I64, seed: int) -> NDArray[np.uint64]:
     """A random number of each id, the same for ever (splitmix64; Steele et al., 2014)."""
     with np.errstate(over='ignore'):
         x = ids.astype(np.uint64) + np.uint64(seed + 1) * np.uint64(0x9E3779B97F4A7C15)
