@@ -24,6 +24,14 @@ def test_a_topic_is_found_with_and_without_its_leading_slash(tmp_path, storage):
     assert there.topics['/cmd'].count == 3
 
 
+def test_a_topic_written_with_and_without_its_slash_is_one(tmp_path):
+    sent = attempt(3)
+    sent[0] = sent[0]._replace(topic='joint_states')
+    there = Bag(bag(tmp_path / 'bag', sent))
+    assert len(list(there.messages(['/joint_states']))) == 4
+    assert there.topics['/joint_states'].count == 4
+
+
 @pytest.mark.parametrize('storage', STORAGES)
 def test_a_bag_of_topics_without_a_slash_is_sound(tmp_path, storage):
     sent = [one._replace(topic=one.topic[1:]) for one in attempt(3)]

@@ -280,9 +280,39 @@ def test_long_episodes_come_in_chunks_that_join(monkeypatch):
     assert steps[0][2][-1] == steps[1][2][0]
 
 
-def test_messages_that_go_back_in_time_are_counted():
-    _, _, converter = run(rules(), *commands(1.0, 1.1), said(0.5, '/state', [0.0]))
-    assert converter.conversion.dropped[converting.BACKWARDS] == 1
+def test_a_clock_that_goes_back_ends_the_episode_and_nothing_is_held_across_it():
+    steps, scores, converter = run(
+        rules(),
+        *commands(1.0, 1.1),
+        said(1.15, '/state', [5.0]),
+        said(1.16, '/score', 3.0),
+        said(0.5, '/command', [0.0]),  # what was observed before is not of this time
+        *commands(0.6, 0.7),
+        said(0.75, '/state', [6.0]),
+        said(0.76, '/score', 4.0),
+    )
+    assert [step[:3] for step in steps] == [(0, 0, [1.0, 1.1, 5.0]), (1, 0, [0.6, 0.7, 6.0])]
+    assert scores == [(0, 0, 2, 3.0), (1, 0, 2, 4.0)]
+    assert converter.conversion.dropped == {
+        converting.CLOCK_BACK: 1,
+        converting.NO_OBSERVATION: 1,
+    }
+
+
+def test_the_time_of_a_message_may_be_that_of_its_header():
+    late = (message._replace(log_time=9 * converting.NS) for message in commands(1.0, 1.1))
+    stamped = [message._replace(stamp=message.publish_time) for message in late]
+    steps, _, converter = run(rules(), *stamped, said(1.15, '/state', [5.0]))
+    assert steps == [(0, 0, [1.0, 1.1, 5.0], [0.1, 0.11], (False, True))]
+    assert converter.conversion.shortest == pytest.approx(0.1)
+
+
+def test_a_topic_has_one_time():
+    both = [{'topic': '/state', 'fields': ['data'], 'time': clock} for clock in ('log', 'header')]
+    with pytest.raises(SettingsError, match='/state has two times, log and header'):
+        rules(observation=both)
+    made = rules(time='header', action={'topic': '/command', 'fields': ['data'], 'time': 'log'})
+    assert made.stamped == {'/state', '/score', '/end'}
 
 
 def joint_state(names, position):

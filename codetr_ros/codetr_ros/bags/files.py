@@ -13,6 +13,7 @@ from codetr_ros.bags.errors import BagError, Damage, Place
 from codetr_ros.bags.metadata import METADATA
 from codetr_ros.system.parsing import brief
 
+_SPLIT = re.compile(r'_(\d+)\.[a-z0-9.]+$')
 _LFS_POINTER = b'version https://git-lfs'
 STORAGES = ('.mcap', '.db3')
 COMPRESSED = '.zstd'
@@ -26,8 +27,15 @@ def storage_of(name: str) -> str:
 
 def _number(name: str) -> tuple[int, str]:
     """Splits are numbered; 10 comes after 9."""
-    match = re.search(r'_(\d+)\.[a-z0-9.]+$', name)
+    match = _SPLIT.search(name)
     return (int(match[1]) if match else -1, name)
+
+
+def _numbered_alike(names: list[str]) -> bool:
+    """Whether all names are of one stem, with a number."""
+    return len({re.sub(_SPLIT, '', name) for name in names}) == 1 and all(
+        _number(name)[0] >= 0 for name in names
+    )
 
 
 def listed_files(folder: Path) -> list[str]:
@@ -53,7 +61,8 @@ def listed_files(folder: Path) -> list[str]:
 
 
 def bag_files(path: Path, on_damage: Callable[[Damage], None] | None) -> list[Path]:
-    """The files of a bag, in order: as its metadata lists them, then by number.
+    """The files of a bag, in order: as its metadata lists them, then by number. Splits of one name
+    are ordered by number, however they are listed: recorders number them as they write.
 
     Raises:
         BagError: there are none. Or one is missing, is no file or is listed twice: `on_damage`, if
@@ -88,6 +97,8 @@ def bag_files(path: Path, on_damage: Callable[[Damage], None] | None) -> list[Pa
         elif times > 1:
             report(path / METADATA, _listed_again(path, name, times), False)
     known = [name for name in dict.fromkeys(listed) if name in there]
+    if _numbered_alike(known):
+        known.sort(key=_number)
     names = [*known, *sorted(there - set(known), key=_number)]
     if not names:
         raise BagError(f'{path} is no bag: it holds no file of {_named()}')

@@ -46,6 +46,7 @@ class McapFile:
             fault is an error.
         shown: the name in places and errors of a file that has been unpacked.
         thorough: compare indexes, summary and the checksums over both too.
+        known: the topics that the file describes, from an earlier reading.
 
     Attributes:
         counts: messages read so far, by topic.
@@ -61,6 +62,7 @@ class McapFile:
         on_damage: OnDamage | None = None,
         shown: Path | None = None,
         thorough: bool = False,
+        known: McapChannels | None = None,
     ) -> None:
         self.path = path
         self.shown = shown or path
@@ -70,7 +72,7 @@ class McapFile:
         self.finished = False
         self._on_damage = on_damage
         self._checks = IndexChecks(MAGIC) if thorough else None
-        self._described = McapChannels()
+        self._described = known or McapChannels()
         self._ids: Counter[int] = Counter()
         self._indexed: Counter[int] | None = None  # messages of the last chunk, by channel
         self._faulty = self._borrowed = False
@@ -80,12 +82,20 @@ class McapFile:
         """The program that wrote it, as its header names it."""
         return self._described.library
 
+    @property
+    def described(self) -> McapChannels:
+        """What it has described so far, for another reading of it."""
+        return self._described
+
     def channels(self) -> list[Channel]:
         """The topics met so far."""
         return self._described.all()
 
-    def messages(self) -> Iterator[RawMessage]:
+    def messages(self, start: Place | None = None) -> Iterator[RawMessage]:
         """Every message, in file order.
+
+        Args:
+            start: begin with the record or chunk there, in a file whose topics are known.
 
         Raises:
             BagError: the file cannot be opened, is no MCAP file, or is damaged: `on_damage`, if
@@ -93,7 +103,7 @@ class McapFile:
         """
         try:
             with self.path.open('rb') as file:
-                yield from self._records(file)
+                yield from self._records(file, start.offset if start else 0)
         except OSError as error:
             self._report(0, f'cannot be read: {error.strerror}', _size(self.path), unread=True)
 
@@ -112,10 +122,10 @@ class McapFile:
         elif not harmless:
             raise damage.error()
 
-    def _records(self, file: BinaryIO) -> Iterator[RawMessage]:
+    def _records(self, file: BinaryIO, start: int) -> Iterator[RawMessage]:
         size = file.seek(0, 2)
         file.seek(0)
-        at = self._begin(file, size)
+        at = start or self._begin(file, size)
         if at == size > len(MAGIC):
             return  # the disk cannot read any of it
         ended = False

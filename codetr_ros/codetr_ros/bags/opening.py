@@ -1,7 +1,7 @@
 """Opens the files of a bag; a compressed one is unpacked first."""
 
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -9,12 +9,16 @@ import zstandard
 
 from codetr_ros.bags.errors import BagError, Damage, Place
 from codetr_ros.bags.files import COMPRESSED
+from codetr_ros.bags.mcap_channels import McapChannels
 from codetr_ros.bags.mcap_file import McapFile
 from codetr_ros.bags.raw import OnDamage
 from codetr_ros.bags.sqlite_file import SqliteFile
 from codetr_ros.system.files import remedy
 
-_KINDS: dict[str, type[McapFile | SqliteFile]] = {'.mcap': McapFile, '.db3': SqliteFile}
+_KINDS: dict[str, Callable[..., McapFile | SqliteFile]] = {
+    '.mcap': McapFile,
+    '.db3': SqliteFile,
+}
 
 
 def report(damage: Damage, on_damage: OnDamage | None) -> None:
@@ -29,16 +33,20 @@ def report(damage: Damage, on_damage: OnDamage | None) -> None:
 
 
 def open_file(
-    path: Path, stack: ExitStack, on_damage: OnDamage | None = None, thorough: bool = False
+    path: Path,
+    stack: ExitStack,
+    on_damage: OnDamage | None = None,
+    thorough: bool = False,
+    known: McapChannels | None = None,
 ) -> McapFile | SqliteFile:
     """One file of a bag; a compressed one is first unpacked beside other temporary files, until
-    the stack is closed.
+    the stack is closed. `known` are the topics of an MCAP file from an earlier reading.
 
     Raises:
         BagError: it cannot be read or unpacked.
     """
     if path.suffix != COMPRESSED:
-        return _KINDS[path.suffix](path, on_damage, thorough=thorough)
+        return _KINDS[path.suffix](path, on_damage, path, thorough, known)
     folder = stack.enter_context(tempfile.TemporaryDirectory(prefix='codetr-bag-'))
     unpacked = Path(folder) / path.stem
     try:
@@ -49,7 +57,7 @@ def open_file(
     except OSError as error:
         text = f'cannot be read: {error.strerror}'
         report(Damage(Place(path, 0), text, 0, unread=True), on_damage)
-    return _KINDS[unpacked.suffix](unpacked, on_damage, path, thorough)
+    return _KINDS[unpacked.suffix](unpacked, on_damage, path, thorough, known)
 
 
 def _write(pieces: Iterable[bytes], path: Path) -> None:

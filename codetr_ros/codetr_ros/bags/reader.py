@@ -7,7 +7,7 @@ the caller asks to receive faults and to go on (`on_damage`).
 """
 
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,10 +18,13 @@ import zstandard
 from codetr_ros.bags.definitions import UNREADABLE, check_own, decode, types_of
 from codetr_ros.bags.errors import BagError, Damage, Place
 from codetr_ros.bags.files import bag_files
+from codetr_ros.bags.mcap_channels import McapChannels
 from codetr_ros.bags.mcap_layout import LARGEST_RECORD, unzstd
 from codetr_ros.bags.names import full_name
 from codetr_ros.bags.opening import open_file, report
 from codetr_ros.bags.raw import Channel, OnDamage, RawMessage
+from codetr_ros.bags.time_order import OrderScan, TimeOrder
+from codetr_ros.bags.timing import Selection, Timing
 from codetr_ros.records import Record, RecordError
 from codetr_ros.records.fields import RECORD_TYPES, type_name
 
@@ -49,6 +52,12 @@ class Message(NamedTuple):
     log_time: int  # [ns]
     publish_time: int  # [ns]
     place: Place
+    stamp: int | None = None  # [ns] of its header, where that was asked for
+
+    @property
+    def time(self) -> int:
+        """By which it is ordered [ns]: that of its header, or when it was received."""
+        return self.log_time if self.stamp is None else self.stamp
 
 
 @dataclass(frozen=True)
@@ -92,6 +101,8 @@ class Bag:
         self.unchecked = 0
         self.files = bag_files(self.path, on_damage)
         self._topics: dict[str, Topic] | None = None
+        self._order: tuple[Selection, TimeOrder] | None = None
+        self._described: dict[Path, McapChannels] = {}
 
     def entries(self, kinds: Collection[type[Record]] | None = None) -> Iterator[Entry]:
         """Our records, in file order. Takes memory for one chunk of the bag.
@@ -133,34 +144,83 @@ class Bag:
         return Entry(kind, record, topic, raw.log_time, raw.publish_time, raw.place)
 
     def messages(
-        self, topics: Collection[str] = (), types: Collection[str] = ()
+        self,
+        topics: Collection[str] = (),
+        types: Collection[str] = (),
+        stamped: Collection[str] = (),
     ) -> Iterator[Message]:
-        """Messages of any type, decoded by the definition in the bag (by those of ROS 2 Jazzy
-        where it has none), in file order.
+        """Messages of any type in order of time, decoded by the definition in the bag (by those of
+        ROS 2 Jazzy where it has none). Where the clock of the bag went back, so do the times.
+
+        The bag is read twice, and the second time in other than file order where it must be.
 
         Args:
             topics: such as `/joint_states`, with or without the leading slash.
             types: such as `sensor_msgs/msg/JointState`. All messages if neither is given.
+            stamped: topics whose messages have the time of their header, not of their receipt.
 
         Raises:
-            BagError: the bag is damaged, or a message's definition is not known.
+            BagError: the bag is damaged, a message's definition is not known, or the messages
+                cannot be brought into an order of time.
         """
-        wanted = {full_name(topic) for topic in topics}
-        for raw in self.raw():
-            channel, topic = raw.channel, full_name(raw.channel.topic)
-            if (topics or types) and topic not in wanted and channel.type not in types:
-                continue
-            _check_encoding(raw)
+        order = self.time_order(topics, types, stamped)
+        self._order = None
+        selection = Selection.of(topics, types, stamped)
+        timing = Timing(selection, self._unpacked)
+        on_damage = None if self.on_damage is None else _known_damage
+        if order.plain:
+            timed: Iterator[tuple[int, RawMessage]] = (
+                one for raw in self._read(order.files, on_damage) if (one := timing(raw))
+            )
+        else:
+            timed = order.read(self._described, timing, on_damage)
+        for time, raw in timed:
+            message = self._message(raw)
+            if message is not None:
+                own = message.topic in selection.stamped
+                yield message._replace(stamp=time) if own else message
+
+    def time_order(
+        self,
+        topics: Collection[str] = (),
+        types: Collection[str] = (),
+        stamped: Collection[str] = (),
+    ) -> TimeOrder:
+        """Read the bag to learn in which order such messages come. `messages` of the same need not
+        read it for that again.
+
+        Raises:
+            BagError: the bag is damaged, or they cannot be brought into an order of time.
+        """
+        selection = Selection.of(topics, types, stamped)
+        if self._order is None or self._order[0] != selection:
+            timing = Timing(selection, self._unpacked)
+            scan = OrderScan()
+            for packed in self.raw():
+                if (timed := timing(packed)) is not None:
+                    time, raw = timed
+                    scan.take(raw, full_name(raw.channel.topic), time)
             try:
-                store = types_of(channel.type, channel.definition)
+                timing.check_clocks()
+                self._order = selection, scan.order(self.files, timing.unset)
             except BagError as error:
-                raise BagError(f'{raw.place}: {error}') from None
-            try:
-                message = store.deserialize_cdr(raw.data, channel.type)
-            except UNREADABLE as error:
-                self._damaged(raw, f'{channel.type} cannot be decoded: {error}')
-                continue
-            yield Message(channel.type, message, topic, raw.log_time, raw.publish_time, raw.place)
+                raise BagError(f'{self.path}: {error}') from None
+        return self._order[1]
+
+    def _message(self, raw: RawMessage) -> Message | None:
+        channel = raw.channel
+        _check_encoding(raw)
+        try:
+            store = types_of(channel.type, channel.definition)
+        except BagError as error:
+            raise BagError(f'{raw.place}: {error}') from None
+        try:
+            message = store.deserialize_cdr(raw.data, channel.type)
+        except UNREADABLE as error:
+            self._damaged(raw, f'{channel.type} cannot be decoded: {error}')
+            return None
+        topic = full_name(channel.topic)
+        return Message(channel.type, message, topic, raw.log_time, raw.publish_time, raw.place)
 
     def raw(self) -> Iterator[RawMessage]:
         """Every message as bytes, in file order.
@@ -168,27 +228,34 @@ class Bag:
         Raises:
             BagError: the bag is damaged.
         """
+        return self._read(self.files, self.on_damage)
+
+    def _read(self, files: Sequence[Path], on_damage: OnDamage | None) -> Iterator[RawMessage]:
         channels: dict[str, Channel] = {}
         counts: Counter[str] = Counter()
         sizes: Counter[str] = Counter()
-        self.in_files, self.unchecked = {}, 0
-        for path in self.files:
+        self.in_files, self.unchecked, self._described = {}, 0, {}
+        for path in files:
             with ExitStack() as stack:
-                opened = open_file(path, stack, self.on_damage, self.thorough)
+                opened = open_file(path, stack, on_damage, self.thorough)
+                self._described[path] = opened.described
                 for packed in opened.messages():
                     message = self._unpacked(packed)
                     if message is not None:
-                        sizes[full_name(message.channel.topic)] += len(message.data)
+                        sizes[message.channel.topic] += len(message.data)
                         yield message
                 for topic, count in opened.counts.items():
-                    counts[full_name(topic)] += count
+                    counts[topic] += count
                 self.in_files[path.name] = opened.counts.total()
                 self.unchecked += opened.unchecked
-                channels |= {full_name(one.topic): one for one in opened.channels()}
-        self._topics = {
-            name: Topic(name, channel.type, counts[name], sizes[name], channel.encoding)
-            for name, channel in sorted(channels.items())
-        }
+                channels |= {channel.topic: channel for channel in opened.channels()}
+        topics: dict[str, Topic] = {}
+        for topic, channel in channels.items():
+            name, count, size = full_name(topic), counts[topic], sizes[topic]
+            if name in topics:  # with and without its leading slash
+                count, size = count + topics[name].count, size + topics[name].bytes
+            topics[name] = Topic(name, channel.type, count, size, channel.encoding)
+        self._topics = dict(sorted(topics.items()))
 
     def _unpacked(self, message: RawMessage) -> RawMessage | None:
         if bytes(message.data[:4]) != _ZSTD_MAGIC:
@@ -228,6 +295,10 @@ class Bag:
     def _damaged(self, message: RawMessage, text: str) -> None:
         damage = Damage(message.place, f'{message.channel.topic}: {text}', len(message.data))
         report(damage, self.on_damage)
+
+
+def _known_damage(_: Damage) -> None:
+    """Receive damage that has been reported when the order was learnt."""
 
 
 def _check_encoding(raw: RawMessage) -> None:

@@ -11,6 +11,7 @@ from urllib.parse import quote
 
 from codetr_ros.bags.definitions import Definition
 from codetr_ros.bags.errors import Damage, Place
+from codetr_ros.bags.mcap_channels import McapChannels
 from codetr_ros.bags.mcap_layout import LARGEST_RECORD
 from codetr_ros.bags.names import full_type_name
 from codetr_ros.bags.raw import Channel, OnDamage, RawMessage
@@ -34,6 +35,7 @@ class SqliteFile:
         on_damage: OnDamage | None = None,
         shown: Path | None = None,
         thorough: bool = False,
+        known: McapChannels | None = None,
     ) -> None:
         self.path = path
         self.shown = shown or path
@@ -44,13 +46,17 @@ class SqliteFile:
         self.finished = False
         self._on_damage = on_damage
         self._channels: dict[int, Channel] = {}
+        self.described = known or McapChannels()  # of MCAP files only
 
     def channels(self) -> list[Channel]:
         """The topics that the file describes; empty before the first message is read."""
         return list(self._channels.values())
 
-    def messages(self) -> Iterator[RawMessage]:
+    def messages(self, start: Place | None = None) -> Iterator[RawMessage]:
         """Every message, in the order of the rows.
+
+        Args:
+            start: begin with the row there.
 
         Raises:
             BagError: the file cannot be opened, is no such database, or is damaged: `on_damage`,
@@ -64,7 +70,8 @@ class SqliteFile:
             connection = self._connect()
             try:
                 self._channels = _channels(connection)
-                yield from self._rows(connection, min(size, LARGEST_RECORD))
+                first = start.offset if start else 1
+                yield from self._rows(connection, min(size, LARGEST_RECORD), first - 1)
             finally:
                 connection.close()
         except OSError as error:
@@ -72,9 +79,8 @@ class SqliteFile:
         except _DAMAGED as error:
             self._report(0, f'the database is damaged: {error}', 0, _unread(error))
 
-    def _rows(self, connection: sqlite3.Connection, most: int) -> Iterator[RawMessage]:
-        """The messages; after rows that cannot be read, those from the next that can."""
-        row = 0
+    def _rows(self, connection: sqlite3.Connection, most: int, row: int) -> Iterator[RawMessage]:
+        """The messages behind a row; after rows that cannot be read, from the next that can."""
         while True:
             try:
                 for message in self._rows_after(connection, row, most):

@@ -16,6 +16,10 @@ from codetr_ros.offline.mapping import Mapping
 from codetr_ros.records import TOPICS, CompositeReward, Transitions
 from codetr_ros.records.fields import type_name
 
+LATE = 'messages that lay behind later ones of their file, put in order of time'
+OVERLAPS = 'files that overlap in time with others, merged in order of time'
+UNSET = 'messages without a time in their header'
+
 
 def convert(bag: Bag, rules: Mapping, folder: Path) -> Conversion:
     """Write a bag for `codetr fit`.
@@ -29,11 +33,19 @@ def convert(bag: Bag, rules: Mapping, folder: Path) -> Conversion:
         BagError: the bag cannot be read, or the new one cannot be written.
         FitError: the mapping names something that is not in the bag.
     """
+    order = bag.time_order(rules.topics, stamped=rules.stamped)
     if missing := sorted(rules.topics - bag.topics.keys()):
         raise FitError(
             f'{bag.path} has no topic {", ".join(missing)}. It has: {", ".join(bag.topics)}'
         )
     converter = Converter(rules, folder.name)
+    for what, count in (
+        (LATE, order.late),
+        (OVERLAPS, order.overlaps),
+        (UNSET, order.unset.total()),
+    ):
+        if count:
+            converter.conversion.dropped[what] += count
     with unfinished(folder, 'convert again') as new:
         _write(_records(bag, rules, converter), rules.source, new)
         if not converter.conversion.steps:
@@ -51,6 +63,6 @@ def _write(records: Iterator[Timed], source: str, folder: Path) -> None:
 
 
 def _records(bag: Bag, rules: Mapping, converter: Converter) -> Iterator[Timed]:
-    for message in bag.messages(topics=rules.topics):
+    for message in bag.messages(rules.topics, stamped=rules.stamped):
         yield from converter.feed(message)
     yield from converter.finish()

@@ -1,13 +1,15 @@
 """Turn ordinary topics into steps and scores, message by message, by a mapping.
 
-The rules of time, where `now` is the time at which a message was received (its log time):
+Messages come in order of time, where `now` is the time of a message: when it was received (its log
+time), or what its own header states. The rules of time:
 
 * The last value received holds (zero-order hold), at most `max_age` seconds for observations.
 * A step begins with each command, or at a fixed rate from an episode's first command on. Its
   observation and action are those that hold at its begin; its next observation is the one that
   holds at the begin of the next step.
 * An episode ends at a message that matches the episode rule, where no command comes for `gap`
-  seconds, and where a step has no observation that is young and finite: no step crosses a hole.
+  seconds, where the clock goes back, and where a step has no observation that is young and
+  finite: no step crosses a hole.
 * The next observation of an episode's last step is the one that holds at the episode's end, or,
   if that is earlier, as long after the step's begin as the step before took. If nothing was
   observed in between, the step is dropped.
@@ -36,7 +38,7 @@ NO_NEXT = 'last steps of episodes without an observation after them'
 CLIPPED = 'commands beyond low or high, clipped'
 NO_JOINTS = 'messages without all of the joints'
 JOINT_TWICE = 'messages that name one of the joints twice'
-BACKWARDS = 'messages received earlier than the one before, taken as simultaneous'
+CLOCK_BACK = 'times that the clock went back, which ended the episode'
 
 
 Timed = tuple[Transitions | CompositeReward, int]
@@ -62,7 +64,8 @@ class Converter:
         self.conversion = Conversion()
         self._rules = rules
         self._run_id = run_id
-        self._now = 0
+        self._now = 0  # [ns] never goes back
+        self._shift = 0  # [ns] by which it is ahead of the clock of the bag
         self._held: list[tuple[int, F64] | None] = [None] * len(rules.observation)
         self._seconds = 0  # [ns] that the last whole step took; 0 in an episode's first
         # the values that held `_seconds` after the pending step's begin, once that time has passed
@@ -80,10 +83,13 @@ class Converter:
         self._sequence = 0
 
     def feed(self, message: Message) -> Iterator[Timed]:
-        """Take a message; yields the records that it completes."""
-        if message.log_time < self._now:
-            self.conversion.dropped[BACKWARDS] += 1
-        self._now = max(self._now, message.log_time)
+        """Take a message; yields the records that it completes.
+
+        Messages come in order of time. An earlier one means that the clock went back.
+        """
+        if message.time + self._shift < self._now:
+            yield from self._clock_back(message.time)
+        self._now = message.time + self._shift
         self.conversion.messages[message.topic] += 1
         yield from self._until(self._now)
         self._scores.advance(self._now)
@@ -106,11 +112,28 @@ class Converter:
 
     def finish(self) -> Iterator[Timed]:
         """End the last episode; yields its records."""
+        yield from self._end_all()
+        yield from self._give_scores()
+
+    def _end_all(self) -> Iterator[Timed]:
+        """Do what is due by now, and end the episode."""
         yield from self._until(self._now + 1)
         yield from self._end(None)
+
+    def _clock_back(self, time: int) -> Iterator[Timed]:
+        """End the episode, and hold no value: the clock starts again, at an earlier time [ns]."""
+        yield from self._end_all()
+        self._held = [None] * len(self._held)
+        self._then = self._cut = None
+        self._shift = self._now + 1 - time
+        self._scores.clock_back(self._shift)
+        self.conversion.dropped[CLOCK_BACK] += 1
+
+    def _give_scores(self) -> Iterator[Timed]:
+        """Yield the scores that are still held: no more can come."""
         self._scores.advance(self._now + 1)
         for score in self._scores.finish():
-            yield score, self._now
+            yield score, self._now - self._shift
 
     def _numbers(self, message: Message, values: mapping.Values) -> F64 | None:
         array = mapping.numbers(message.message, values)
@@ -188,7 +211,7 @@ class Converter:
             continues = self._cut is not None and now - self._cut <= self._rules.episode.gap * NS
             self._cut = None
             for score in self._scores.begin_episode(self._episode, now, continues):
-                yield score, self._now
+                yield score, self._now - self._shift
         self._pending = _Step(now, observation, action)
         self._then = None
         self._scores.step_begun(now)
@@ -275,7 +298,7 @@ class Converter:
         self._sequence += 1
         self._written += len(steps)
         self.conversion.steps += len(steps)
-        yield chunk, self._now
+        yield chunk, self._now - self._shift
 
 
 def _finite(values: F64) -> bool:

@@ -41,6 +41,7 @@ class EpisodeScores:
         self._names: Counter[str | None] = Counter()  # of the episodes that are held
         self._nameless: ScoredEpisode | None = None  # the one that the next message would name
         self._next_name: str | None = None
+        self._shift = 0  # [ns] from a stamp to the time of steps
         self._forgotten = False  # whether no step is left of the last episode
 
     # ------------------------------------------------------------------------------------------
@@ -138,14 +139,16 @@ class EpisodeScores:
         if not np.isfinite(value):
             self._drop(conversion.SCORE_NOT_FINITE)
             return
-        at = now if rule.stamp is None else moment(content, rule.stamp, topic)
+        at = now if rule.stamp is None else moment(content, rule.stamp, topic) + self._shift
         begin = at - round((rule.seconds or 0.0) * NS)
         if rule.begin is not None:
-            begin = moment(content, rule.begin, topic)
+            begin = moment(content, rule.begin, topic) + self._shift
         name = None if rule.id is None else name_in(content, rule.id, topic)
         verdict = Verdict(value, at, now, begin, name)
         if name is not None:
             self._named.setdefault(name, []).append(verdict)
+        elif at > now and self._shift:  # stamped before the clock went back, most likely
+            self._drop(conversion.SCORE_OF_EITHER)
         elif at > now:
             self._ahead.append(verdict)
         else:
@@ -158,6 +161,16 @@ class EpisodeScores:
             self._ahead = [v for v in self._ahead if v.at >= now]
             for verdict in due:
                 self._book(verdict)
+
+    def clock_back(self, shift: int) -> None:
+        """Note that the clock of the bag went back; no episode runs.
+
+        Args:
+            shift: what to add to the new times [ns], so that they follow those before.
+        """
+        self._shift = shift
+        self._drop(conversion.SCORE_AHEAD, len(self._ahead))
+        self._ahead = []
 
     def finish(self) -> Iterator[CompositeReward]:
         """Yield the scores that are still held: no more can come."""

@@ -9,16 +9,15 @@ from pydantic import Field, model_validator
 
 from codetr_ros.config import Group, SettingsError, in_words, validate
 from codetr_ros.offline.errors import FitError
-from codetr_ros.offline.message_fields import FieldPath, Topic, field
+from codetr_ros.offline.message_fields import Clock, FieldPath, Timed, Topic, field
 from codetr_ros.offline.score_rules import Score
 from codetr_ros.records import F64
 from codetr_ros.system.parsing import ParseError, read_yaml
 
 
-class Values(Group):
+class Values(Timed):
     """Numbers in the messages of a topic."""
 
-    topic: Topic = Field(description='full name')
     fields: tuple[FieldPath, ...] = Field(
         min_length=1,
         description='fields in this order, such as position, data[0] or pose.position.x; an array '
@@ -55,6 +54,7 @@ class Episodes(Group):
     """The ends of episodes."""
 
     topic: Topic | None = Field(None, description='a message on it ends the episode')
+    time: Clock | None = Field(None, description='as with the other topics')
     field: FieldPath | None = Field(None, description='only where this field ...')
     equals: bool | int | float | str | None = Field(None, description='... has this value')
     terminal: bool = Field(
@@ -109,6 +109,11 @@ class Mapping(Group):
         pattern=in_words(r'^[A-Za-z_]\w*$', 'a name of letters, digits and _'),
         description='name of the robot',
     )
+    time: Clock = Field(
+        'log',
+        description='the time of a message. log: when it was received; header: what its own '
+        'header states',
+    )
     observation: tuple[Values, ...] = Field(
         min_length=1, description='topics, one after the other'
     )
@@ -135,9 +140,25 @@ class Mapping(Group):
     @property
     def topics(self) -> set[str]:
         """All topics of the mapping."""
-        named = {values.topic for values in self.observation}
-        named |= {self.action.topic, self.score.topic}
-        return named | ({self.episode.topic} if self.episode.topic else set())
+        return {topic for topic, _ in self._clocks()}
+
+    @property
+    def stamped(self) -> set[str]:
+        """The topics whose messages have the time of their header."""
+        return {topic for topic, clock in self._clocks() if clock == 'header'}
+
+    def _clocks(self) -> list[tuple[str, Clock]]:
+        parts: tuple[Timed | Episodes, ...]
+        parts = (*self.observation, self.action, self.score, self.episode)
+        return [(part.topic, part.time or self.time) for part in parts if part.topic]
+
+    @model_validator(mode='after')
+    def _one_clock_for_each_topic(self) -> 'Mapping':
+        clocks = dict(self._clocks())
+        for topic, clock in self._clocks():
+            if clock != clocks[topic]:
+                raise ValueError(f'{topic} has two times, log and header: a topic has one')
+        return self
 
 
 def load(path: Path) -> Mapping:

@@ -1,13 +1,13 @@
 """Values in messages, named by paths such as `pose.position.x` or `poses[1].y`."""
 
 import re
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field
 
 from codetr_ros.bags.names import full_name
-from codetr_ros.config import in_words
+from codetr_ros.config import Group, in_words
 from codetr_ros.offline.errors import FitError
 
 NS = 10**9
@@ -26,6 +26,18 @@ FieldPath = Annotated[
         )
     ),
 ]
+
+Clock = Literal['log', 'header']
+
+
+class Timed(Group):
+    """Messages of a topic."""
+
+    topic: Topic = Field(description='full name')
+    time: Clock | None = Field(
+        None, description='log or header, where it is not the `time` of the whole mapping'
+    )
+
 
 _PART = re.compile(r'(\w+)(?:\[(\d+)\])?$')
 

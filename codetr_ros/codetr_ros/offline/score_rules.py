@@ -4,8 +4,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from codetr_ros.config import Group
-from codetr_ros.offline.message_fields import FieldPath, Topic
+from codetr_ros.offline.message_fields import FieldPath, Timed
 
 Of = Literal['since_last', 'last_steps', 'window', 'last_episode', 'episode']
 
@@ -19,10 +18,9 @@ _BELONGS = {
 """Keys that mean something for these values of `of` only."""
 
 
-class Score(Group):
+class Score(Timed):
     """The score topic."""
 
-    topic: Topic = Field(description='full name')
     field: FieldPath = Field('data', description='the number that is the score')
     of: Of = Field(
         'since_last',
@@ -42,8 +40,8 @@ class Score(Group):
     )
     stamp: FieldPath | None = Field(
         None,
-        description='field with the time of the score, such as header.stamp; without: the time at '
-        'which it was received',
+        description='field with the time of the score, such as header.stamp; without: the time of '
+        'its message',
     )
     id: FieldPath | None = Field(
         None, description='field that names the episode, as `id` of `episode` does'
