@@ -74,3 +74,21 @@ def test_what_comes_while_a_fall_is_doubted_is_counted_once_it_is_refuted():
     assert begins == [0]
     assert clock.periods[0].late == 2
     assert '/new' in clock.periods[0].spans
+
+
+@pytest.mark.parametrize('time', [0, 90])
+@pytest.mark.parametrize('before', [[], [('/rare', 500)]])
+def test_a_rare_topic_may_be_the_first_after_the_clock_went_back(time, before):
+    first = [*before, *ticks('/a', '/b')]
+    clock, begins = follow(*first, ('/rare', time), ('/rare', time + 1), *ticks('/a', '/b'))
+    assert begins == [0, len(first)]
+    assert '/rare' in clock.periods[1].spans
+    assert ('/rare' in clock.periods[0].spans) == bool(before)
+    assert clock.periods[0].lateness <= 500 * MS
+
+
+def test_a_rare_topic_that_is_only_late_stays_in_its_period():
+    clock, begins = follow(
+        *ticks('/a', '/b'), ('/rare', 500), *ticks('/a', '/b', begin=1000, end=1200)
+    )
+    assert begins == [0] and clock.periods[0].late == 1

@@ -7,11 +7,11 @@ from codetr_ros.bags.errors import BagError
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.verify import verify
 from codetr_ros.config import validate
-from codetr_ros.offline import converted_bag, converting
+from codetr_ros.offline import conversion, converted_bag, converting
 from codetr_ros.offline.converted_bag import convert
 from codetr_ros.offline.mapping import Mapping
 from codetr_ros.records import CompositeReward, Transitions
-from helpers.arm import JOINTS, NOON, NS, attempt, bag, joint_state, mcap_file, rules
+from helpers.arm import JOINTS, NOON, NS, Sent, attempt, bag, joint_state, mcap_file, number, rules
 
 SCORES = [(first, 10, float(first + 9)) for first in (0, 10, 20, 30)]
 MS = 1_000_000
@@ -165,3 +165,35 @@ def test_a_header_that_goes_back_once_is_put_in_its_place(tmp_path):
     found, _, made = converted(there, tmp_path / 'out', **BY_HEADER)
     assert np.array_equal(found[0], expected())
     assert made.dropped == {converted_bag.LATE: 1}
+
+
+def test_a_verdict_after_the_clock_went_back_is_of_the_attempt_before(tmp_path):
+    first = [one for one in attempt(40, begin=0) if one.topic != '/score']
+    verdict = Sent('/score', 0, number(7.0))
+    second = attempt(40, begin=0)
+    there = mcap_file(tmp_path / 'x.mcap', [*first, verdict, *second])
+    found, scores, _ = converted(there, tmp_path / 'out')
+    assert found.keys() == {0, 1}
+    assert scores == {0: [(0, 40, 7.0)], 1: SCORES}
+
+
+def test_a_stamp_of_before_the_clock_went_back_is_not_taken_for_one_of_after(tmp_path):
+    score = {
+        'topic': '/score',
+        'field': 'position[0]',
+        'of': 'since_last',
+        'stamp': 'header.stamp',
+    }
+    attempts = [one for one in attempt(40, begin=0) if one.topic != '/score']
+
+    def verdict(received, stamp, value):
+        return Sent('/score', received * MS, joint_state(stamp * MS, ['score'], [value]))
+
+    sent = [*attempts, verdict(801, 400, 5.0), *attempts, verdict(801, 400, 6.0)]
+    sent.insert(len(attempts) + 11, verdict(90, 700, 4.0))
+    found, scores, made = converted(
+        mcap_file(tmp_path / 'x.mcap', sent), tmp_path / 'out', score=score
+    )
+    assert found.keys() == {0, 1}
+    assert scores == {0: [(0, 20, 5.0)], 1: [(0, 20, 6.0)]}
+    assert made.dropped == {converting.CLOCK_BACK: 1, conversion.SCORE_OF_EITHER: 1}

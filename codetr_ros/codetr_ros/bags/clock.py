@@ -20,7 +20,8 @@ _WITNESSES = 5  # messages in a row that must be behind where the fall is shorte
 _OPPOSED = 10  # falls from one time that other topics do not follow: more, and nothing is sure
 _OVERTAKEN = 5  # messages of its own that a topic must fall behind where the fall is shorter
 _MOST_DOUBTED = 1000  # messages in which no topic of before comes again
-_MOST_FALLS = 10_000  # of single messages; each one costs memory
+_LONGEST_TAIL = 100  # messages between the time that the clock went back and the fall of a topic
+_MOST_CUTS = 10_000  # places where the clock may have gone back; each one costs memory
 
 
 @dataclass(slots=True)
@@ -90,6 +91,20 @@ class Period:
         return replace(self, spans=spans)
 
 
+@dataclass(slots=True)
+class _Tail:
+    """The last messages of a period, all behind those before them."""
+
+    block: int  # that begins with them
+    before: Period | None  # without them; None where they cannot begin a period
+    messages: list[tuple[str, int]] = field(default_factory=list)
+
+    @property
+    def latest(self) -> int:
+        """The latest time of them [ns]."""
+        return max(time for _, time in self.messages)
+
+
 class Clock:
     """Follows the times of one file's messages.
 
@@ -104,7 +119,8 @@ class Clock:
         self.periods: list[Period] = [before or Period(0)]
         self._doubted: list[tuple[str, int]] = []  # messages since a fall, until others follow it
         self._witnesses = 0
-        self._falls = 0
+        self._tail: _Tail | None = None
+        self._falls = self._cuts = 0
         self._opposed: dict[str, tuple[int, int]] = {}  # falls alone: from which time, how many
 
     def take(self, topic: str, time: int, place: Place, block: int) -> bool:
@@ -129,14 +145,19 @@ class Clock:
         if span is not None and time >= period.end and not self._doubted:  # as nearly always
             period.end = span.high = time
             span.recent.append(time)
+            self._tail = None
             return False
-        cut = span is not None and self._falls_behind(span, time)
-        if cut:
+        cut, fell = False, span is not None and self._falls_behind(span, time)
+        if fell:
             assert span is not None
-            period = self._begin(Fall(topic, span.high, time, place), block)
-        if cut or self._doubted:
+            cut = self._begin(Fall(topic, span.high, time, place), block)
+        elif time < period.end - TOLERANCE and period.spans:
+            cut = self._late(topic, time, block)
+        else:
+            self._tail = None
+        if fell or self._doubted:
             self._doubted.append((topic, time))
-        period.take(topic, time)
+        self.periods[-1].take(topic, time)
         return cut
 
     @staticmethod
@@ -146,8 +167,23 @@ class Clock:
             return False
         return behind > _SURE or sum(one > time for one in span.recent) >= _OVERTAKEN
 
-    def _begin(self, fall: Fall, block: int) -> Period:
-        """Begin a period that is doubted as yet."""
+    def _late(self, topic: str, time: int, block: int) -> bool:
+        """Note a message that lies behind others, though not behind its own topic: a topic that
+        comes rarely may be the first after the clock went back. Returns whether a block begins.
+        """
+        if self._tail is None:
+            self._cuts += 1
+            before = self.periods[-1].copy() if self._cuts <= _MOST_CUTS else None
+            self._tail = _Tail(block, before)
+        tail = self._tail
+        if len(tail.messages) < _LONGEST_TAIL:
+            tail.messages.append((topic, time))
+        else:
+            tail.before = None
+        return tail.before is not None and tail.block == block
+
+    def _begin(self, fall: Fall, block: int) -> bool:
+        """Begin a period that is doubted as yet; returns whether a block must begin here, too."""
         self._falls += 1
         high, times = self._opposed.get(fall.topic, (0, 0))
         if high == fall.high and times >= (1 if high - fall.to > _SURE else _OPPOSED):
@@ -155,16 +191,21 @@ class Clock:
                 f'{fall} and stays behind, while other topics go on: either their clocks differ, '
                 'or the file is in no order at all. Write it in the order of receipt first'
             )
-        if self._falls > _MOST_FALLS:
+        if self._falls > _MOST_CUTS:
             raise BagError(
-                f'{fall}, and such happens more than {_MOST_FALLS} times: the messages cannot be '
+                f'{fall}, and such happens more than {_MOST_CUTS} times: the messages cannot be '
                 'brought into an order of time. Write them in the order of receipt first'
             )
+        tail, self._tail, self._doubted, self._witnesses = self._tail, None, [], 0
         period = Period(block, fall)
-        self._doubted = []
-        self._witnesses = 0
+        if tail is not None and tail.before is not None and tail.latest <= fall.to + TOLERANCE:
+            self.periods[-1] = tail.before
+            period.block = tail.block
+            for message in tail.messages:
+                period.take(*message)
+            self._doubted = tail.messages
         self.periods.append(period)
-        return period
+        return period.block == block
 
     def _weigh(self, topic: str, time: int) -> None:
         """Decide by the messages that follow whether the clock went back."""
@@ -182,6 +223,7 @@ class Clock:
             high, times = self._opposed.get(fall.topic, (fall.high, 0))
             self._opposed[fall.topic] = fall.high, (times if high == fall.high else 0) + 1
         self.periods.pop()
+        self._tail = None
         for message in self._doubted:
             before.take(*message)
         self._doubted = []

@@ -81,9 +81,10 @@ class _File:
     def fall_after(self, before: Period) -> Fall | None:
         """How the clock went back from a period of another file to the begin of this file."""
         clock = Clock(before.copy())
-        for topic, time, place in self.head:
-            clock.take(topic, time, place, 0)
-        return clock.periods[1].fall if len(clock.periods) > 1 else None
+        for i, (topic, time, place) in enumerate(self.head):
+            clock.take(topic, time, place, i)
+        first = clock.periods[1] if len(clock.periods) > 1 else None
+        return first.fall if first is not None and not first.block else None
 
 
 def _full(block: Block) -> bool:
