@@ -42,18 +42,12 @@ def main(arguments: Sequence[str]) -> int:
     given = parse_arguments(Arguments, prog='codetr evaluate', arguments=arguments)
     folder = Path(given.run_dir)
     try:
-        settings = run_folder.read_settings(folder)
-        # reading a policy needs neither the GPU that it was learnt on nor a compiler
-        changes: dict[str, int | str] = {
-            'evaluate_every': 1,
-            'device': 'cpu',
-            'sac.compile': False,
-        }
+        changes: dict[str, int] = {}
         if given.episodes is not None:
             changes['evaluate_episodes'] = given.episodes
         if given.seed is not None:
             changes['seed'] = given.seed
-        settings = settings.changed(changes, 'command line')
+        settings = settings_to_read(folder).changed(changes, 'command line')
     except (RunFolderError, SettingsError) as error:
         return refuse(str(error))
 
@@ -82,6 +76,19 @@ def main(arguments: Sequence[str]) -> int:
     )
     shown.print(table(results))
     return 0
+
+
+def settings_to_read(folder: Path) -> Settings:
+    """The settings of the run in this folder, changed so that its policy can be read and evaluated
+    here.
+
+    Raises:
+        RunFolderError: this is not the folder of a run.
+        SettingsError: its settings are refused.
+    """
+    # reading a policy needs neither the GPU that it was learnt on nor a compiler
+    changes = {'evaluate_every': 1, 'device': 'cpu', 'sac.compile': False}
+    return run_folder.read_settings(folder).changed(changes, str(folder))
 
 
 def newest_policy(folder: Path, settings: Settings) -> Policy:

@@ -49,6 +49,10 @@ class ControlSuiteEnvironment(Environment):
         # these tasks have no terminal states, and were made without a time limit
         return flat(step.observation['observations']), float(step.reward), False, False
 
+    def physics(self) -> tuple[Any, Any]:
+        """MuJoCo's model and data."""
+        return self._env.physics.model.ptr, self._env.physics.data.ptr
+
     def close(self) -> None:
         """Free what the environment holds."""
         self._env.close()

@@ -171,6 +171,10 @@ class Environment(ABC):
         bounds, which the environment may change.
         """
 
+    def physics(self) -> tuple[Any, Any] | None:
+        """MuJoCo's model and data; None for an environment that is not of MuJoCo."""
+        return None
+
     @abstractmethod
     def close(self) -> None:
         """Free what the environment holds."""

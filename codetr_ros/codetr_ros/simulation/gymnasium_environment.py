@@ -138,6 +138,15 @@ class GymnasiumEnvironment(Environment):
     def _raised(self, error: BaseException, remedy: str) -> TaskError:
         return self._fault(f'the environment raised {in_words(error)}. Mend it there; {remedy}')
 
+    def physics(self) -> tuple[Any, Any] | None:
+        """MuJoCo's model and data; None for an environment that is not of MuJoCo."""
+        import mujoco
+
+        env = self._env.unwrapped
+        model, data = getattr(env, 'model', None), getattr(env, 'data', None)
+        mine = isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData)
+        return (model, data) if mine else None
+
     def close(self) -> None:
         """Free what the environment holds. An error in that costs nothing that was learnt: it is
         logged.
