@@ -3,6 +3,7 @@ import itertools
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,11 @@ import pytest
 from scipy import stats
 
 from codetr_ros import cli, config
-from codetr_ros.benchmark import anchors, curves, paper, report, results, statistics, table
+from codetr_ros.benchmark import anchors, curves, report, results, sections, statistics, table
 from codetr_ros.benchmark.spec import BenchmarkError, Cell
 from codetr_ros.cores.evaluator import Evaluator
 from codetr_ros.records import EpisodeResult, Policy
+from codetr_ros.runs.document import Heading, Table
 from helpers.benchmark_folders import benchmark
 
 SCORES = {
@@ -106,15 +108,22 @@ def test_the_oracle_is_shown_but_neither_best_nor_compared(tmp_path: Path) -> No
     assert found['none'].best
 
 
-def test_delays_outside_25_to_200_count_alone_only(tmp_path: Path) -> None:
+def test_delays_outside_25_to_200_count_in_the_own_table_and_not_beside_the_paper(
+    tmp_path: Path,
+) -> None:
     folder = benchmark(
         tmp_path / 'b', lambda cell: cell.settings.delay / 1000, delays=[5, 25, 200, 500]
     )
-    together, alone = table.rows(results.read([folder.path]))
+    found = results.read([folder.path])
+    together, alone = table.rows(found, table.TABLE_DELAYS)
 
     assert [row.delays for row in together] == [(25, 200)]
     assert entries(together[0])['none'].mean == pytest.approx(0.1125)
     assert [row.delays for row in alone] == [(5,), (25,), (200,), (500,)]
+
+    together, _ = table.rows(found)
+    assert [row.delays for row in together] == [(5, 25, 200, 500)], 'the own table has all'
+    assert entries(together[0])['none'].mean == pytest.approx((5 + 25 + 200 + 500) / 4000)
 
 
 def test_the_interquartile_mean_is_that_of_the_middle_half() -> None:
@@ -156,9 +165,10 @@ def test_failed_and_missing_cells_are_listed_with_their_errors_and_counted(
     assert cli.main(['benchmark', 'report', str(folder.path)]) == 0
 
     shown = capsys.readouterr().out
-    assert '**0.2500 (0.0000) [2 of 3, 1 failed]**' in shown
-    assert '[2 of 3] |' in shown
+    assert '0.2500 (0.0000) [2 of 3, 1 failed]*' in shown
+    assert re.search(r'\[2 of 3\]  ', shown)
     text = (folder.path / 'report' / 'table.md').read_text()
+    assert '**0.2500 (0.0000) [2 of 3, 1 failed]**' in text
     assert '6 cells: 4 finished, 1 failed, 1 missing' in text
     after = text.split('## Failed and missing cells')[1]
     assert 'Failed: labels are not <finite> after 3 gradient steps' in after
@@ -254,19 +264,61 @@ def test_the_papers_numbers_stand_beside_those_of_its_task_only(tmp_path: Path) 
         changes: dict[str, Any] = {'tasks': [task], 'config': {'evaluate_episodes': 1}}
         folder = benchmark(tmp_path / task, lambda cell: 0.25, **changes)
         _, said = report.write([folder.path])
-        assert ('0.5493 (0.0187)' in said) == beside
         text = (folder.path / 'report' / 'table.md').read_text()
-        assert '0.5493 (0.0187)' in text
-        assert ('has no numbers for' in text) != beside
-    assert 'Here it is, by task: InvertedPendulum-v5 1.' in text
+        for shown in (said, text):
+            assert ('0.5493 (0.0187)' in shown) == beside
+            assert ("paper's Table 2" in shown) == beside
+        assert ('Here it is, by task: Ant-v4 6.' in text) == beside
+        assert text.index('## Scores') < text.find("paper's Table 2") or not beside
+    assert 'r_max, the unit of scores: InvertedPendulum-v5 1.' in text
 
 
-def test_the_settings_that_differ_from_the_papers_are_named() -> None:
-    settings = config.load('paper').changed({'sac.batch': 64, 'delay': 5, 'seed': 3})
+def test_the_settings_that_differ_from_the_nearest_preset_are_named(tmp_path: Path) -> None:
+    for base in config.PRESETS:
+        folder = benchmark(
+            tmp_path / base,
+            lambda cell: 0.5,
+            delays=[5, 50],
+            steps=config.load(base).steps,
+            config={'base': base, 'sac.batch': 7, 'sac.tau': 1e-6},
+        )
+        blocks = sections.settings(results.read([folder.path]))
+        assert isinstance(blocks[0], Heading) and f'the preset {base}, ' in blocks[0].text
+        assert isinstance(blocks[1], Table)
+        batch = str(config.load(base).sac.batch)
+        assert blocks[1].rows == [
+            ['sac.batch', batch, '7', 'InvertedPendulum-v5'],
+            ['sac.tau', '0.005', '0.000001', 'InvertedPendulum-v5'],
+        ]
 
-    found = paper.settings_differences(settings.model_dump(mode='json'))
 
-    assert found == [('sac.batch', 256, 64)]
+@pytest.mark.parametrize('delays', [[10], [10, 500]])
+def test_the_terminal_shows_the_numbers_whatever_the_delays(
+    delays: list[int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = benchmark(
+        tmp_path / 'b', lambda cell: cell.settings.delay / 1000, methods=['none'], delays=delays
+    )
+
+    assert cli.main(['benchmark', 'report', str(folder.path)]) == 0
+
+    shown = capsys.readouterr().out
+    scores, returns = shown.split('\nTrue returns\n')
+    for delay in delays:
+        assert re.search(rf'^sum +{delay} +{delay / 1000:.4f} \(0\.0000\)\*', scores, re.M)
+        assert re.search(rf'^sum +{delay} +{delay:.1f} \(0\.0\)$', returns, re.M)
+    assert ('mean of 10, 500' in scores) == (len(delays) > 1)
+    assert '|' not in shown
+
+
+def test_the_curves_begin_with_the_random_policy_at_step_0(made: list[results.Result]) -> None:
+    some = [r for r in made if r.method == 'codetr' and r.delay == 25]
+    random = some[0].evaluations[0].model_copy(update={'step': 0, 'score_mean': 0.125})
+    begun = [replace(r, summary=r.summary.model_copy(update={'random': random})) for r in some]
+
+    steps, means, _, _ = curves.curve(begun, 'evaluations', 'score_mean')
+
+    assert (steps, means[0]) == ([0, 1000, 2000, 3000], 0.125)
 
 
 def test_several_benchmarks_are_reported_together_unless_they_contradict_each_other(

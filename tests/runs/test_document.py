@@ -109,6 +109,27 @@ def test_what_is_folded_and_what_is_linked_is_in_markdown_too():
     assert text == '### More\n\ninside\n\n- [bag/](bag/): the recording\n'
 
 
+def test_a_terminal_gets_aligned_tables_without_pictures():
+    text = document.plain(
+        [
+            Heading('Scores'),
+            Picture('curve.png', 'curve'),
+            Table(['method', 'score'], [['none', '0.5'], ['codetr', Bold('12.25')]]),
+            Facts([('a', '1'), ('long', '2')]),
+        ]
+    )
+    assert text.splitlines() == [
+        'Scores',
+        '',
+        'method   score',
+        'none       0.5',
+        'codetr  12.25*',
+        '',
+        'a     1',
+        'long  2',
+    ]
+
+
 def test_markdown_keeps_a_table_whole_whatever_its_cells_hold():
     text = document.markdown([Table(['a', 'b'], [['1|2', Bold('3\n4')]])])
     assert text.splitlines() == ['| a | b |', '| --- | ---: |', '| 1\\|2 | **3 4** |']

@@ -1,6 +1,5 @@
 """Pictures of a benchmark: learning curves and reward recovery over training."""
 
-import io
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -9,6 +8,7 @@ import numpy as np
 
 from codetr_ros.benchmark.results import Result
 from codetr_ros.benchmark.table import methods
+from codetr_ros.runs import pictures
 from codetr_ros.runs.run_summary import Evaluation, RewardRecovery
 
 _COLOURS = (
@@ -27,7 +27,7 @@ _STYLES = ('-', '--', '-.', ':')
 _ANCHORS = {'random': ('random policy', '--'), 'zero': ('standing still', ':')}
 
 _ROWS: Mapping[str, Callable[[Result], Sequence[Evaluation | RewardRecovery]]] = {
-    'evaluations': lambda result: result.evaluations,
+    'evaluations': lambda result: result.summary.evaluated() if result.summary else (),
     'reward_recovery': lambda result: result.reward_recovery,
 }
 
@@ -40,7 +40,8 @@ def curve(results: Sequence[Result], key: str, of: str) -> Curve:
 
     Args:
         results: cells that differ in their seed only.
-        key: of the summary: `evaluations` or `reward_recovery`.
+        key: of the summary: `evaluations`, which begin with the random policy at step 0, or
+            `reward_recovery`.
         of: name of the number in a row.
     """
     at: dict[int, list[float]] = defaultdict(list)
@@ -97,43 +98,46 @@ def _picture(
     names: Mapping[str, str],
     anchors: Mapping[str, Mapping[str, float]],
 ) -> bytes:
-    # Without pyplot there is no display, and no state that outlives the picture.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    def draw(figure: pictures.Figure) -> None:
+        figure.suptitle(title, fontsize=10, wrap=True)
+        handles: dict[str, Any] = {}
+        panels = figure.subplots(len(names), 1, sharex=True)
+        for axes, (of, label) in zip(panels, names.items(), strict=True):
+            axes.set_ylabel(label)
+            for policy, numbers in anchors.items():
+                name, style = _ANCHORS[policy]
+                handles[name] = axes.axhline(numbers[of], color='#777777', ls=style, lw=1.5)
+            # the first method last, so that nothing hides it
+            for method in reversed(methods(results)):
+                some = [result for result in results if result.method == method]
+                if line := _curve(axes, curve(some, key, of), order.index(method)):
+                    handles[method] = line
+            pictures.plain(axes)
+        panels[-1].set_xlabel('environment steps')
+        panels[-1].set_xlim(left=0)
+        all_names = (*order, *(n for n, _ in _ANCHORS.values()))
+        shown = [name for name in all_names if name in handles]
+        if shown:
+            lines = [handles[name] for name in shown]
+            figure.legend(lines, shown, loc='outside lower center', ncols=4, frameon=False)
 
-    figure = Figure(figsize=(12, 4.6), dpi=110, layout='constrained')
-    FigureCanvasAgg(figure)
-    figure.suptitle(title, fontsize=11)
-    handles: dict[str, Any] = {}
-    panels = figure.subplots(1, len(names))
-    for axes, (of, label) in zip(panels, names.items(), strict=True):
-        axes.set(xlabel='environment steps', ylabel=label)
-        axes.grid(alpha=0.25)
-        axes.spines[['top', 'right']].set_visible(False)
-        for policy, numbers in anchors.items():
-            name, style = _ANCHORS[policy]
-            handles[name] = axes.axhline(numbers[of], color='#777777', ls=style, lw=1.5)
-        # the first method last, so that nothing hides it
-        for method in reversed(methods(results)):
-            some = [result for result in results if result.method == method]
-            steps, means, low, high = curve(some, key, of)
-            if steps:
-                i = order.index(method)
-                colour = _COLOURS[i % len(_COLOURS)]
-                axes.fill_between(steps, low, high, color=colour, alpha=0.12, lw=0)
-                (handles[method],) = axes.plot(
-                    steps,
-                    means,
-                    _STYLES[i // len(_COLOURS) % len(_STYLES)],
-                    color=colour,
-                    marker='o',
-                    markersize=3.5,
-                    lw=2.6 if i == 0 else 1.6,
-                )
-    shown = [name for name in (*order, *(n for n, _ in _ANCHORS.values())) if name in handles]
-    if shown:
-        places: Callable[..., Any] = figure.legend
-        places([handles[n] for n in shown], shown, loc='outside right center', frameon=False)
-    picture = io.BytesIO()
-    figure.savefig(picture, format='png')
-    return picture.getvalue()
+    return pictures.png((pictures.WIDE, 6.4), draw)
+
+
+def _curve(axes: pictures.Axes, of: Curve, i: int) -> Any:
+    """Draw the curve of the i-th method, with its range; None if it has no point."""
+    steps, means, low, high = of
+    if not steps:
+        return None
+    colour = _COLOURS[i % len(_COLOURS)]
+    axes.fill_between(steps, low, high, color=colour, alpha=0.12, lw=0)
+    (line,) = axes.plot(
+        steps,
+        means,
+        _STYLES[i // len(_COLOURS) % len(_STYLES)],
+        color=colour,
+        marker='o',
+        markersize=3.5,
+        lw=2.6 if i == 0 else 1.6,
+    )
+    return line

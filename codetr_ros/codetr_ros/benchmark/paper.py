@@ -3,11 +3,6 @@
 The supplement's Table 2: scores on Ant-v2, delays from 25 to 200, three trials.
 """
 
-from collections.abc import Mapping
-from typing import Any
-
-from codetr_ros import config
-
 TASKS = ('Ant-v4',)
 """Tasks whose scores may be compared with the paper's: Ant-v4 stands in for Ant-v2."""
 
@@ -87,12 +82,3 @@ DIFFERENCES = (
     'A last segment that an early end cuts short is scored like any other; the paper is silent.',
 )
 """Known differences, and decisions where the paper is silent."""
-
-
-def settings_differences(settings: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
-    """Settings in which a cell differs from the preset `paper`: name, there, here.
-
-    The axes of a benchmark (task, composite, delay, method, seed) are left out.
-    """
-    varied = ('task', 'composite', 'delay', 'method', 'seed')
-    return [row for row in config.differences(settings, 'paper') if row[0] not in varied]

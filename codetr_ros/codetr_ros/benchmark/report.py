@@ -11,7 +11,7 @@ from codetr_ros.benchmark import curves, scores, sections, table
 from codetr_ros.benchmark.folder import Folder
 from codetr_ros.benchmark.results import Result, read
 from codetr_ros.config import delay_in_words
-from codetr_ros.runs.document import Block, Heading, markdown, page
+from codetr_ros.runs.document import Block, Heading, markdown, page, plain
 from codetr_ros.simulation import tasks
 from codetr_ros.system.files import atomic_write
 
@@ -26,7 +26,7 @@ def write(paths: Sequence[Path], out: Path | None = None) -> tuple[Path, str]:
         out: folder of the report; by default `report` in the first folder.
 
     Returns:
-        The report's folder, and its tables over delays as Markdown.
+        The report's folder, and its scores and returns as text for a terminal.
 
     Raises:
         BenchmarkError: a folder is not a benchmark's, or the benchmarks cannot be compared.
@@ -40,28 +40,36 @@ def write(paths: Sequence[Path], out: Path | None = None) -> tuple[Path, str]:
     pictures = dict(_pictures(results, anchors))
     for name, picture in pictures.items():
         atomic_write(folder / name, picture)
+    r_max = _r_max(results)
     together, alone = table.rows(results)
-    summary: list[Block] = scores.table_2(results, together, anchors)
-    blocks: list[Block] = [
-        Heading(sections.title(results), 1),
-        *sections.protocol(results),
-        *summary,
-        *scores.each_delay(alone),
+    # lengths that are drawn and whole episodes are in no mean over delays
+    each = [*together, *(row for row in alone if isinstance(row.delays[0], str))]
+    in_span, _ = table.rows(results, table.TABLE_DELAYS)
+    head: list[Block] = [Heading(sections.title(results), 1), *sections.protocol(results, r_max)]
+    numbers: list[Block] = [
+        *scores.own(together, alone, anchors),
         *scores.returns(together, alone),
-        *scores.interquartile(table.aggregate(together), together),
+    ]
+    beside = scores.beside_the_paper(in_span)
+    blocks: list[Block] = [
+        *head,
+        *numbers,
+        *scores.interquartile(table.aggregate(each), each),
         *scores.anchors(anchors),
         *sections.recovery(results),
         *sections.pictures(pictures),
         *sections.unfinished(results),
-        *sections.the_paper(_r_max(results)),
+        *beside,
+        *sections.differences(results, r_max),
         *sections.settings(results),
         *sections.sessions(paths),
     ]
     atomic_write(folder / 'table.md', markdown(blocks))
     atomic_write(folder / 'index.html', page(blocks))
-    atomic_write(folder / 'table.csv', table_csv([*together, *alone]))
+    several = [row for row in together if len(row.delays) > 1]
+    atomic_write(folder / 'table.csv', table_csv([*several, *alone]))
     atomic_write(folder / 'cells.csv', cells_csv(results))
-    return folder, markdown(summary)
+    return folder, plain([*head, *numbers, *beside])
 
 
 def _r_max(results: Sequence[Result]) -> dict[str, float]:

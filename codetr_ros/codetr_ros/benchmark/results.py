@@ -10,6 +10,9 @@ from codetr_ros.benchmark.spec import BenchmarkError
 from codetr_ros.runs.run_summary import Evaluation, RewardRecovery, RunSummary
 from codetr_ros.system.parsing import ParseError, read_yaml
 
+VARIED = ('task', 'composite', 'delay', 'method', 'seed')
+"""The settings in which the cells of a benchmark differ."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
@@ -123,7 +126,7 @@ def _check(results: Sequence[Result]) -> None:
         other = first.setdefault(result.task, result)
         for name in {**result.settings, **other.settings}:
             here, there = result.settings.get(name), other.settings.get(name)
-            if name not in ('composite', 'delay', 'method', 'seed') and here != there:
+            if name not in VARIED and here != there:
                 raise BenchmarkError(
                     f'{result.folder}: cell {result.cell} has {name} = {here!r}, but '
                     f'{other.cell} in {other.folder} has {there!r}: what is compared must be '

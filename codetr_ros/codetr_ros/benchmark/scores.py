@@ -6,9 +6,8 @@ import numpy as np
 
 from codetr_ros.benchmark import paper
 from codetr_ros.benchmark.anchors import Anchors
-from codetr_ros.benchmark.results import Result
 from codetr_ros.benchmark.statistics import CONFIDENCE, REPLICATES, SIGNIFICANCE
-from codetr_ros.benchmark.table import ORACLES, TABLE_DELAYS, Aggregate, Entry, Row, methods
+from codetr_ros.benchmark.table import ORACLES, TABLE_DELAYS, Aggregate, Entry, Row
 from codetr_ros.runs.document import Block, Bold, Heading, Items, Paragraph, Table
 
 NONE = '–'
@@ -29,8 +28,8 @@ def _score(entry: Entry, mean: float | None, spread: float | None, digits: int) 
     return f'{mean:.{digits}f}{around}{lacking}'
 
 
-def _line(row: Row, order: Sequence[str], first: Sequence[str]) -> list[str | Bold]:
-    cells: list[str | Bold] = list(first)
+def _line(row: Row, order: Sequence[str]) -> list[str | Bold]:
+    cells: list[str | Bold] = [row.composite, _delays(row)]
     by_method = {entry.method: entry for entry in row.entries}
     for method in order:
         entry = by_method.get(method)
@@ -43,36 +42,71 @@ def _line(row: Row, order: Sequence[str], first: Sequence[str]) -> list[str | Bo
 
 
 def _delays(row: Row) -> str:
-    return ', '.join(map(str, row.delays))
+    delays = ', '.join(map(str, row.delays))
+    return f'mean of {delays}' if len(row.delays) > 1 else delays
 
 
-def table_2(results: Sequence[Result], together: Sequence[Row], anchors: Anchors) -> list[Block]:
-    """The layout of the supplement's Table 2, a table for each task."""
-    low, high = TABLE_DELAYS
-    blocks: list[Block] = [Heading(f'Scores, mean over delays {low} to {high}')]
-    for task in dict.fromkeys(result.task for result in results):
-        rows = [row for row in together if row.task == task]
-        if not rows:
-            blocks.append(Paragraph(f'{task}: no delay from {low} to {high} was planned.'))
-            continue
-        order = methods([result for result in results if result.task == task])
-        lines: list[list[str | Bold]] = []
-        for row in rows:
-            line = _line(row, order, [row.composite, _delays(row)])
-            lines.append([*line, *(_anchor(row, anchors, which) for which in _ANCHORS)])
-            if task in paper.TASKS and row.composite in paper.TABLE_2:
-                lines.append(_paper_line(row.composite, order))
-        head = ['composite', 'delays', *order, *_ANCHORS.values()]
+def own(together: Sequence[Row], alone: Sequence[Row], anchors: Anchors) -> list[Block]:
+    """The scores of every delay, and their mean if there are several: a table for each task."""
+    blocks: list[Block] = [Heading('Scores')]
+    for task in dict.fromkeys(row.task for row in alone):
+        rows = _rows(task, together, alone)
+        order = _methods(rows)
+        lines = [
+            [*_line(row, order), *(_anchor(row, anchors, which) for which in _ANCHORS)]
+            for row in rows
+        ]
+        head = ['composite', 'delay', *order, *_ANCHORS.values()]
         blocks += [Heading(task, 3), Table(head, lines)]
-    return [*blocks, *_reading()]
+    return [*blocks, _reading(any(len(row.delays) > 1 for row in together))]
+
+
+def _rows(task: str, together: Sequence[Row], alone: Sequence[Row]) -> list[Row]:
+    """The rows of a task, by composite reward: each delay, then the mean if there are several."""
+    mine = [row for row in (*alone, *together) if row.task == task]
+    several = [row for row in together if row.task == task and len(row.delays) > 1]
+    rows = []
+    for composite in dict.fromkeys(row.composite for row in mine):
+        rows += [row for row in alone if (row.task, row.composite) == (task, composite)]
+        rows += [row for row in several if row.composite == composite]
+    return rows
+
+
+def _methods(rows: Sequence[Row]) -> list[str]:
+    return list(dict.fromkeys(entry.method for row in rows for entry in row.entries))
+
+
+def beside_the_paper(in_span: Sequence[Row]) -> list[Block]:
+    """Our scores beside the supplement's Table 2, for the tasks that it has; else nothing.
+
+    Args:
+        in_span: the rows over the delays of that table.
+    """
+    low, high = TABLE_DELAYS
+    rows = [row for row in in_span if row.task in paper.TASKS and row.composite in paper.TABLE_2]
+    if not rows:
+        return []
+    order = _methods(rows)
+    lines: list[list[str | Bold]] = []
+    for row in rows:
+        lines += [_line(row, order), _paper_line(row.composite, order)]
+    return [
+        Heading("Beside the paper's Table 2"),
+        Paragraph(
+            f'Ant-v2 there, {", ".join(paper.TASKS)} here. Mean over delays from {low} to {high}; '
+            'that a cell of the paper is such a mean is inferred. There: 3 trials, a million '
+            'steps.'
+        ),
+        Table(['composite', 'delays', *order], lines),
+    ]
 
 
 def _paper_line(composite: str, order: Sequence[str]) -> list[str | Bold]:
-    cells: list[str | Bold] = ["... in the paper's Table 2", '25 to 200']
+    cells: list[str | Bold] = ['... in the paper', '25 to 200']
     for method in order:
         number = paper.TABLE_2[composite].get(method)
         cells.append(f'{number[0]:.4f} ({number[1]:.4f})' if number else NONE)
-    return [*cells, NONE, NONE]
+    return cells
 
 
 _ANCHORS = {'random': 'random policy', 'zero': 'standing still'}
@@ -83,38 +117,24 @@ def _anchor(row: Row, anchors: Anchors, which: str) -> str:
     return f'{np.mean(scores):.4f}'
 
 
-def _reading() -> list[Block]:
-    low, high = TABLE_DELAYS
-    return [
-        Items(
-            [
-                f'A cell is the mean over the delays from {low} to {high} that were planned and '
-                'over seeds. That a cell of the paper is such a mean is inferred.',
-                'In brackets: sample standard deviation over seeds of the mean over delays; '
-                'nothing if there is one seed.',
-                'Bold: the highest mean, and all that do not differ from it by a paired t-test at '
-                f'{SIGNIFICANCE:.0%} over pairs of seed and delay. Few pairs show few '
-                'differences. With fewer than two pairs no test is possible: then only the '
-                'highest mean is bold.',
-                f'{", ".join(ORACLES)} sees the rewards that no other method may see: it is '
-                'never marked as best, nor compared.',
-                '[n of m, k failed]: only n of m cells have finished; the mean is over those, '
-                'whose delays and seeds may differ from those of other entries.',
-                'random policy, standing still: the trivial anchors, mean over the same delays.',
-            ]
-        )
-    ]
-
-
-def each_delay(alone: Sequence[Row]) -> list[Block]:
-    """Scores of each delay alone."""
-    blocks: list[Block] = [Heading('Scores, each delay alone')]
-    for task in dict.fromkeys(row.task for row in alone):
-        rows = [row for row in alone if row.task == task]
-        order = list(dict.fromkeys(e.method for row in rows for e in row.entries))
-        lines = [_line(row, order, [row.composite, _delays(row)]) for row in rows]
-        blocks += [Heading(task, 3), Table(['composite', 'delay', *order], lines)]
-    return blocks
+def _reading(several: bool) -> Block:
+    means = ['A row of several delays is the mean over them and over seeds.'] if several else []
+    return Items(
+        [
+            *means,
+            'In brackets: sample standard deviation over seeds; nothing if there is one seed.',
+            'Bold (* in a terminal): the highest mean, and all that do not differ from it by a '
+            f'paired t-test at {SIGNIFICANCE:.0%} over pairs of seed and delay. Few pairs show '
+            'few differences. With fewer than two pairs no test is possible: then only the '
+            'highest mean is bold.',
+            f'{", ".join(ORACLES)} sees the rewards that no other method may see: it is never '
+            'marked as best, nor compared.',
+            '[n of m, k failed]: only n of m cells have finished; the mean is over those, whose '
+            'delays and seeds may differ from those of other entries.',
+            'random policy, standing still: a uniformly random policy, and the action 0. A method '
+            'that does not beat both has learnt nothing that counts.',
+        ]
+    )
 
 
 def returns(together: Sequence[Row], alone: Sequence[Row]) -> list[Block]:
@@ -126,10 +146,9 @@ def returns(together: Sequence[Row], alone: Sequence[Row]) -> list[Block]:
             'over seeds as above.'
         ),
     ]
-    several = [row for row in together if len(row.delays) > 1]
     for task in dict.fromkeys(row.task for row in alone):
-        rows = [row for row in (*several, *alone) if row.task == task]
-        order = list(dict.fromkeys(e.method for row in rows for e in row.entries))
+        rows = _rows(task, together, alone)
+        order = _methods(rows)
         lines: list[list[str | Bold]] = []
         for row in rows:
             by_method = {entry.method: entry for entry in row.entries}
@@ -138,7 +157,7 @@ def returns(together: Sequence[Row], alone: Sequence[Row]) -> list[Block]:
                 e = by_method.get(method)
                 line.append(_score(e, e.return_mean, e.return_spread, 1) if e else NONE)
             lines.append(line)
-        blocks += [Heading(task, 3), Table(['composite', 'delays', *order], lines)]
+        blocks += [Heading(task, 3), Table(['composite', 'delay', *order], lines)]
     return blocks
 
 

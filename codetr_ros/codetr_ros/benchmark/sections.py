@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
+from codetr_ros import config
 from codetr_ros.benchmark import paper
 from codetr_ros.benchmark.folder import Folder
-from codetr_ros.benchmark.results import Result
+from codetr_ros.benchmark.results import VARIED, Result
 from codetr_ros.benchmark.scores import NONE
 from codetr_ros.benchmark.table import methods
-from codetr_ros.config import Settings
 from codetr_ros.runs.document import (
     Block,
     Bold,
@@ -22,6 +22,7 @@ from codetr_ros.runs.document import (
     Verbatim,
 )
 from codetr_ros.runs.numbers import exact
+from codetr_ros.runs.report_origin import setting
 
 
 def _every(results: Sequence[Result], name: str) -> str:
@@ -33,8 +34,13 @@ def title(results: Sequence[Result]) -> str:
     return f'Benchmark: {_every(results, "task")}'
 
 
-def protocol(results: Sequence[Result]) -> list[Block]:
-    """The methods, tasks and settings that were run, and the states of the cells."""
+def protocol(results: Sequence[Result], r_max: Mapping[str, float]) -> list[Block]:
+    """The methods, tasks and settings that were run, and the states of the cells.
+
+    Args:
+        results: of all cells.
+        r_max: the largest reward of a step, by task.
+    """
     counts = {state: sum(r.state == state for r in results) for state in _STATES}
     steps = ', '.join(map(str, dict.fromkeys(r.settings['steps'] for r in results)))
     episodes = ', '.join(map(str, dict.fromkeys(r.settings['evaluate_episodes'] for r in results)))
@@ -43,8 +49,9 @@ def protocol(results: Sequence[Result]) -> list[Block]:
             f'Methods {_every(results, "method")}; composite rewards '
             f'{_every(results, "composite")}; delays {_every(results, "delay")}; seeds '
             f'{_every(results, "seed")}; {steps} steps. Score: composite return of the last '
-            f"evaluation's {episodes} episodes over that of an agent that earns r_max at every "
-            'step (1 is perfect; standing still need not be 0: see the anchors).'
+            f"evaluation's episodes ({episodes}) over that of an agent that earns r_max at every "
+            'step (1 is perfect; standing still need not be 0). r_max, the unit of scores: '
+            f'{_units(r_max)}.'
         ),
         Paragraph(
             f'{len(results)} cells: '
@@ -116,50 +123,44 @@ def unfinished(results: Sequence[Result]) -> list[Block]:
     return blocks
 
 
-def the_paper(r_max: Mapping[str, float]) -> list[Block]:
-    """The paper's Table 2, and the differences from ours."""
-    order = list(paper.TABLE_2['sum'])
-    lines: list[list[str | Bold]] = [
-        [composite, *(f'{by[m][0]:.4f} ({by[m][1]:.4f})' for m in order)]
-        for composite, by in paper.TABLE_2.items()
+def differences(results: Sequence[Result], r_max: Mapping[str, float]) -> list[Block]:
+    """All known differences from the paper's table; nothing if its task is not among ours."""
+    units = {task: value for task, value in r_max.items() if task in paper.TASKS}
+    if not units:
+        return []
+    mine = _settings([result for result in results if result.task in units], 'paper')
+    blocks: list[Block] = [
+        Heading('How it differs from the paper', 3),
+        Items([text.format(r_max=_units(units)) for text in paper.DIFFERENCES]),
     ]
-    others = [task for task in r_max if task not in paper.TASKS]
-    units = ', '.join(f'{task} {exact(value)}' for task, value in r_max.items())
-    return [
-        Heading("The paper's Table 2, and how ours differs"),
-        Paragraph('Ant-v2, delays from 25 to 200, 3 trials, a million steps.'),
-        Table(['composite', *order], lines),
-        *(
-            [
-                Paragraph(
-                    f'The supplement has no numbers for {", ".join(others)}: these are not '
-                    'comparable with the table above.'
-                )
-            ]
-            if others
-            else []
-        ),
-        Items([text.format(r_max=units) for text in paper.DIFFERENCES]),
-    ]
+    if mine is not None:
+        blocks += [Paragraph('Settings that differ from the preset paper:'), mine]
+    return blocks
+
+
+def _units(r_max: Mapping[str, float]) -> str:
+    return ', '.join(f'{task} {exact(value)}' for task, value in r_max.items())
 
 
 def settings(results: Sequence[Result]) -> list[Block]:
-    """Settings that differ from those of the paper."""
-    lines: dict[tuple[str, str, str], list[str]] = {}
-    descriptions = Settings().flat()
+    """The settings of the cells that differ from the nearest preset."""
+    preset = config.nearest(results[0].settings)
+    table = _settings(results, preset)
+    if table is None:
+        return [Heading('Settings'), Paragraph(f'Those of the preset {preset}.')]
+    return [Heading(f'Settings that differ from the preset {preset}, the nearest'), table]
+
+
+def _settings(results: Sequence[Result], preset: str) -> Table | None:
+    """The settings that differ from a preset, but for those that vary; None if there are none."""
+    lines: dict[tuple[str, str, str], dict[str, None]] = {}
     for result in results:
-        for name, there, here in paper.settings_differences(result.settings):
-            shown = str(there) if name in descriptions else NONE
-            tasks = lines.setdefault((name, shown, str(here)), [])
-            if result.task not in tasks:
-                tasks.append(result.task)
+        for name, there, here in config.differences(result.settings, preset):
+            if name not in VARIED:
+                key = name, setting(there), setting(here)
+                lines.setdefault(key, {})[result.task] = None
     rows: list[list[str | Bold]] = [[*key, ', '.join(tasks)] for key, tasks in lines.items()]
-    if not rows:
-        return [Heading('Settings'), Paragraph('Those of the preset `paper`.')]
-    return [
-        Heading('Settings that differ from the preset paper'),
-        Table(['setting', 'paper', 'here', 'task'], rows),
-    ]
+    return Table(['setting', preset, 'here', 'task'], rows) if rows else None
 
 
 def sessions(paths: Sequence[Path]) -> list[Block]:

@@ -78,21 +78,25 @@ def methods(results: Sequence[Result]) -> list[str]:
     return list(dict.fromkeys(result.method for result in results))
 
 
-def rows(results: Sequence[Result]) -> tuple[list[Row], list[Row]]:
-    """The rows over delays 25 to 200, and those of each delay alone.
+def rows(
+    results: Sequence[Result], span: tuple[int, int] | None = None
+) -> tuple[list[Row], list[Row]]:
+    """The rows over several delays, and those of each delay alone.
 
-    A task and composite reward without a delay in that range has no row of the first kind. Lengths
-    that are drawn and whole episodes have rows of their own only.
+    Args:
+        results: of all cells.
+        span: the least and the greatest delay of the rows over several; None: all delays. A task
+            and composite reward without a delay in it has no such row. Lengths that are drawn and
+            whole episodes have rows of their own only.
     """
     groups: dict[tuple[str, str], list[Result]] = defaultdict(list)
     for result in results:
         groups[result.task, result.composite].append(result)
-    low, high = TABLE_DELAYS
     together, alone = [], []
     for (task, composite), group in groups.items():
         delays = sorted({result.delay for result in group}, key=_longest)
         numbers = (delay for delay in delays if isinstance(delay, int))
-        if within := tuple(delay for delay in numbers if low <= delay <= high):
+        if within := tuple(d for d in numbers if span is None or span[0] <= d <= span[1]):
             together.append(_row(task, composite, within, group))
         alone += [_row(task, composite, (delay,), group) for delay in delays]
     return together, alone

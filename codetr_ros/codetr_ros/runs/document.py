@@ -200,6 +200,47 @@ def _markdown_cell(each: Cell) -> str:
     return each.replace('|', '\\|').replace('\n', ' ')
 
 
+def plain(blocks: Sequence[Block]) -> str:
+    """The document for a terminal: tables aligned, bold cells with an asterisk, no pictures.
+
+    Lines are as long as they are: a terminal wraps them, a file keeps them.
+    """
+    texts = (_plain(block) for block in blocks)
+    return '\n\n'.join(text for text in texts if text) + '\n'
+
+
+def _plain(block: Block) -> str:
+    match block:
+        case Heading(text, _) | Paragraph(text, _) | Verbatim(text):
+            return text
+        case Items(texts):
+            return '\n'.join(f'- {text}' for text in texts)
+        case Links(rows):
+            return '\n'.join(f'- {target}: {text}' for target, text in rows)
+        case Table(head, rows):
+            return _aligned([head, *rows])
+        case Facts(pairs):
+            return _aligned(pairs, left=True)
+        case Folded(title, blocks):
+            return '\n\n'.join([title, *filter(None, map(_plain, blocks))])
+        case Picture() | Gallery():
+            return ''
+
+
+def _aligned(rows: Sequence[Sequence[Cell]], left: bool = False) -> str:
+    """Columns two spaces apart; all but the first are numbers, unless all are `left`."""
+    cells = [[f'{c.text}*' if isinstance(c, Bold) else c for c in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    lines = []
+    for row in cells:
+        shown = [
+            cell.ljust(width) if left or not i else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append('  '.join(shown).rstrip())
+    return '\n'.join(lines)
+
+
 def page(blocks: Sequence[Block]) -> str:
     """The document as an HTML page. Its title is its first heading."""
     title = next(block.text for block in blocks if isinstance(block, Heading))
