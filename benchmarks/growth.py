@@ -47,6 +47,7 @@ def one_run(steps: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix='codetr-growth-') as where:
         out = Path(where) / 'run'
         command = [sys.executable, '-m', 'codetr_ros.cli', 'train', '--out', str(out)]
+        command += ['--no-film']
         command += ['--steps', str(steps), '--memory-steps', str(max(steps, 1000))]
         for name, value in FLAGS.items():
             command += [f'--{name}', *str(value).split()]

@@ -236,7 +236,7 @@ def whole_run(
     """Do one run by the users' own command, in an environment; returns its times [s]."""
     with tempfile.TemporaryDirectory() as folder:
         out, marks = Path(folder, 'run'), Path(folder, 'marks.json')
-        command = ['train', *flags, '--out', str(out)]
+        command = ['train', '--no-film', *flags, '--out', str(out)]
         if in_process:
             command = [str(MARKED), str(marks), *command]
         else:

@@ -35,7 +35,7 @@ SMALL = {
     'sac.hidden': 8,
     'sac.batch': 8,
 }
-TINY = [f'--{name}={value}' for name, value in SMALL.items()]
+TINY = ['--no-film', *(f'--{name}={value}' for name, value in SMALL.items())]
 """Flags of a run that takes seconds."""
 
 

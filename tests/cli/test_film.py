@@ -1,5 +1,6 @@
 """The film strip of a run's report."""
 
+import base64
 import io
 import os
 import subprocess
@@ -10,8 +11,9 @@ from pathlib import Path
 import matplotlib.image
 import numpy as np
 import pytest
+import yaml
 
-from codetr_ros import config
+from codetr_ros import cli, config
 from codetr_ros.cli import film
 from codetr_ros.cores import in_process
 from codetr_ros.runs import folder as run_folder
@@ -148,3 +150,27 @@ def test_a_run_without_a_policy_is_not_drawn_and_the_note_tells_why(
 
     assert note.startswith('No frames of the robot: ')
     assert 'holds no checkpoint of the learner' in note
+
+
+@pytest.mark.slow
+def test_train_and_report_put_the_film_into_the_report(
+    tmp_path: Path, driver: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in os.environ.items():  # what `codetr train` sets ends with this test
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv('MUJOCO_GL', driver)
+    file, folder = tmp_path / 'tiny.yaml', tmp_path / 'run'
+    file.write_text(yaml.safe_dump(SETTINGS.model_dump(mode='json')))
+
+    assert cli.main(['train', '--in-process', '--config', str(file), '--out', str(folder)]) == 0
+
+    page = (folder / 'report.html').read_text()
+    assert 'Drawing it took' in page
+    assert base64.b64encode((folder / 'film.png').read_bytes()).decode() in page
+
+    # where nothing can be drawn, the report goes on and keeps the frames that there are
+    monkeypatch.setenv('MUJOCO_GL', 'disable')
+    assert cli.main(['report', str(folder)]) == 0
+    page = (folder / 'report.html').read_text()
+    assert 'No new frames of the robot: MuJoCo cannot draw here (disable: ' in page
+    assert base64.b64encode((folder / 'film.png').read_bytes()).decode() in page

@@ -42,7 +42,7 @@ def watched() -> dict[str, Any]:
 
 
 def test_nodes_that_nobody_watched_get_the_summary_of_a_watched_run(folder, capsys):
-    assert cli.main(['report', str(folder)]) == 0
+    assert cli.main(['report', '--no-film', str(folder)]) == 0
 
     said, due = summary_of(folder), watched()
     for name in ('run_id', 'steps', 'phases', 'evaluations', 'random', 'settings', 'final_score'):
@@ -59,7 +59,7 @@ def test_nodes_that_nobody_watched_get_the_summary_of_a_watched_run(folder, caps
 
 
 def test_what_the_command_that_did_the_run_knew_is_kept(folder):
-    assert cli.main(['report', str(folder)]) == 0
+    assert cli.main(['report', '--no-film', str(folder)]) == 0
     before = run_summary.read(folder / run_folder.SUMMARY)
     known = before.model_copy(
         update={'failure': 'sim was ended by SIGKILL', 'wall_s': 77.0, 'versions': {'torch': '1'}}
@@ -68,7 +68,7 @@ def test_what_the_command_that_did_the_run_knew_is_kept(folder):
     for name in (run_folder.METRICS, run_folder.REPORT, run_folder.PICTURE):
         (folder / name).unlink()
 
-    assert cli.main(['report', str(folder)]) == 0
+    assert cli.main(['report', '--no-film', str(folder)]) == 0
 
     assert run_summary.read(folder / run_folder.SUMMARY).model_dump(
         exclude={'steps_per_s'}
@@ -80,12 +80,12 @@ def test_nodes_that_gave_up_or_were_stopped_are_a_failure_or_an_interruption(fol
     path = run_folder.report_path(folder, 'learner', 'learner')
     stopped = reports.read(path).model_copy(update={'finished': False})
     reports.write(path, stopped)
-    assert cli.main(['report', str(folder)]) == 0
+    assert cli.main(['report', '--no-film', str(folder)]) == 0
     assert (summary_of(folder)['interrupted'], summary_of(folder)['failure']) == (True, None)
 
     (folder / run_folder.SUMMARY).unlink()
     reports.write(path, stopped.model_copy(update={'error': 'training has diverged'}))
-    assert cli.main(['report', str(folder)]) == 0
+    assert cli.main(['report', '--no-film', str(folder)]) == 0
     assert summary_of(folder)['failure'] == 'learner: training has diverged'
 
 
@@ -94,7 +94,7 @@ def test_the_bag_of_a_killed_recorder_is_read_as_far_as_it_goes(folder, capsys):
     (folder / run_folder.BAG / 'metadata.yaml').unlink()
     file.write_bytes(file.read_bytes()[: int(file.stat().st_size * 0.7)])
 
-    assert cli.main(['report', str(folder)]) == 0
+    assert cli.main(['report', '--no-film', str(folder)]) == 0
 
     said = summary_of(folder)
     assert (
@@ -105,14 +105,14 @@ def test_the_bag_of_a_killed_recorder_is_read_as_far_as_it_goes(folder, capsys):
 
 
 def test_of_a_run_without_a_bag_report_and_picture_are_made_again(folder):
-    assert cli.main(['report', str(folder)]) == 0
+    assert cli.main(['report', '--no-film', str(folder)]) == 0
     before = (folder / run_folder.SUMMARY).read_bytes()
     for path in (folder / run_folder.BAG).iterdir():
         path.unlink()
     (folder / run_folder.BAG).rmdir()
     (folder / run_folder.REPORT).unlink()
 
-    assert cli.main(['report', str(folder)]) == 0
+    assert cli.main(['report', '--no-film', str(folder)]) == 0
 
     assert (folder / run_folder.SUMMARY).read_bytes() == before
     assert (folder / run_folder.REPORT).stat().st_size

@@ -20,6 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / 'codetr_ros'
 VERSION = ElementTree.parse(PACKAGE / 'package.xml').getroot().findtext('version')
 TINY = [
+    '--no-film',
     *('--steps=250', '--phase-steps=100', '--warmup-steps=100', '--evaluate-every=100'),
     *('--codetr.layers=1', '--codetr.embedding=8', '--codetr.first-gradient-steps=2'),
     *('--codetr.gradient-steps=1', '--sac.hidden=8', '--sac.batch=8', '--evaluate-episodes=1'),

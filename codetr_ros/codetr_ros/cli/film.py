@@ -28,6 +28,8 @@ DEADLINE = 30.0
 FRAMES = 5
 WIDTH, HEIGHT = 240, 180
 
+HELP = 'draw the robot under the random and the last policy for the report; takes seconds'
+"""Of the flag that asks for a film."""
 PROGRAM = (sys.executable, '-m', 'codetr_ros.cli.film')
 
 Act = Callable[['EpisodeRunner'], 'F32']
@@ -76,12 +78,17 @@ def make(
         if done.returncode == 0 and (folder / run_folder.FILM).is_file():
             return f'{done.stdout.strip()} Drawing it took {spent:.1f} s.'
         if done.returncode == NOT_TO_BE_DRAWN:
-            return f'No frames of the robot: {done.stdout.strip()}.'
+            return f'{_without(folder)}{done.stdout.strip()}.'
         faults.append(f'{driver}: {_why(done)}')
     return (
-        f'No frames of the robot: MuJoCo cannot draw here ({"; ".join(faults)}). Nothing else '
-        'depends on it.'
+        f'{_without(folder)}MuJoCo cannot draw here ({"; ".join(faults)}). Nothing else depends '
+        'on it.'
     )
+
+
+def _without(folder: Path) -> str:
+    earlier = (folder / run_folder.FILM).is_file()
+    return 'No new frames of the robot: ' if earlier else 'No frames of the robot: '
 
 
 def _why(done: subprocess.CompletedProcess[str]) -> str:

@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from codetr_ros.cli import FAILED, refuse, results
+from codetr_ros.cli import film as film_strip
 from codetr_ros.cli.terminal import console, parse_arguments
 from codetr_ros.config import Settings, SettingsError, from_canonical
 from codetr_ros.records import RunSpec
@@ -33,6 +34,7 @@ class Arguments:
     run_dir: Annotated[
         Path, tyro.conf.Positional, tyro.conf.arg(metavar='FOLDER', help="the run's folder")
     ]
+    film: Annotated[bool, tyro.conf.arg(help=film_strip.HELP)] = True
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,9 +64,9 @@ def main(arguments: Sequence[str]) -> int:
     try:
         found = look(folder)
         if found.bag is None:
-            built = again(folder, found)
+            built = again(folder, found, given.film)
         else:
-            built = from_bag(folder, found, found.bag, log)
+            built = from_bag(folder, found, found.bag, log, given.film)
     except (RunFolderError, SettingsError) as error:
         return refuse(str(error))
     except OSError as error:
@@ -91,7 +93,7 @@ def look(folder: Path) -> Found:
     return Found(known, bag, run_summary.read(path) if path.exists() else None)
 
 
-def again(folder: Path, found: Found) -> RunSummary:
+def again(folder: Path, found: Found, draw: bool) -> RunSummary:
     """Write picture and report again from the summary of a run without a bag.
 
     Raises:
@@ -103,11 +105,13 @@ def again(folder: Path, found: Found) -> RunSummary:
             f'{folder} holds neither a bag nor a {run_folder.SUMMARY}, so nothing is known of a '
             'run: give the folder of a run, to the recorder as its parameter folder too'
         )
-    report.write(folder, found.before)
+    report.write(folder, found.before, film_strip.make(folder) if draw else '')
     return found.before
 
 
-def from_bag(folder: Path, found: Found, bag: Path, log: Callable[[str], None]) -> RunSummary:
+def from_bag(
+    folder: Path, found: Found, bag: Path, log: Callable[[str], None], draw: bool
+) -> RunSummary:
     """Write summary, metrics, picture and report of a run from its bag.
 
     Args:
@@ -115,6 +119,7 @@ def from_bag(folder: Path, found: Found, bag: Path, log: Callable[[str], None]) 
         found: what is in it.
         bag: its bag.
         log: prints a line for people.
+        draw: draw the robot too.
 
     Raises:
         RunFolderError: the bag holds no run.
@@ -143,7 +148,7 @@ def from_bag(folder: Path, found: Found, bag: Path, log: Callable[[str], None]) 
         before.failure if before else _failure(found.reports),
     )
     built = built.model_copy(update=_kept(built, before))
-    results.write(folder, summary, built)
+    results.write(folder, summary, built, draw)
     return built
 
 

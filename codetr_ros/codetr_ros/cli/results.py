@@ -6,6 +6,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from codetr_ros.cli import film
 from codetr_ros.records import (
     Commit,
     CompositeReward,
@@ -69,14 +70,20 @@ def complete(
         )
 
 
-def write(folder: Path, summary: Summary, built: RunSummary) -> None:
-    """Write summary, metrics, picture and report into a run's folder.
+def write(folder: Path, summary: Summary, built: RunSummary, draw: bool) -> None:
+    """Write summary, metrics, pictures and report into a run's folder.
+
+    Args:
+        folder: the run's folder.
+        summary: has the records of the run.
+        built: the summary itself.
+        draw: draw the robot too, if it can be drawn here; takes seconds.
 
     Raises:
         OSError: one of them cannot be written.
     """
     write_summary(folder, built, summary.metrics_csv(), summary.segments())
-    report.write(folder, built)
+    report.write(folder, built, film.make(folder) if draw else '')
 
 
 def short(path: Path) -> str:
@@ -108,10 +115,12 @@ def show(summary: RunSummary, folder: Path, console: Console) -> None:
     for name, file in (
         ('report', run_folder.REPORT),
         ('picture', run_folder.PICTURE),
+        ('film', run_folder.FILM),
         ('summary', run_folder.SUMMARY),
         ('metrics', run_folder.METRICS),
     ):
-        table.add_row(name, short(folder / file))
+        if name != 'film' or (folder / file).is_file():
+            table.add_row(name, short(folder / file))
     if summary.bag:
         table.add_row('bag', short(Path(summary.bag)))
     console.print()

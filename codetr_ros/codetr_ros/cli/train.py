@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import tyro
 
 from codetr_ros import config
-from codetr_ros.cli import FAILED, INTERRUPTED, refuse, results
+from codetr_ros.cli import FAILED, INTERRUPTED, film, refuse, results
 from codetr_ros.cli.flags import parse
 from codetr_ros.cli.terminal import console
 from codetr_ros.config import Settings, SettingsError
@@ -118,6 +118,7 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
             ],
             False,
         ),
+        ('film', Annotated[bool, tyro.conf.arg(help=film.HELP)], True),
     ]
     try:
         settings, extra = parse(arguments, 'codetr train', DESCRIPTION, 'quick', more)
@@ -157,7 +158,7 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
     run_id = f'r{stamp.replace("-", "_")}_{secrets.token_hex(2)}'
     topics = None if in_process else Topics(extra['namespace'], extra['peer_deadline'], start)
     command = shlex.join(['codetr', 'train', *arguments])
-    return train(settings, run_id, folder, topics, command)
+    return train(settings, run_id, folder, topics, command, extra['film'])
 
 
 def _wrong(extra: Mapping[str, Any]) -> str | None:
@@ -182,6 +183,7 @@ def train(
     folder: Path,
     topics: Topics | None = None,
     command: str | None = None,
+    draw: bool = False,
 ) -> int:
     """Do a run and write everything about it into its folder.
 
@@ -191,6 +193,7 @@ def train(
         folder: its folder, which exists.
         topics: how the nodes are started; None: run in process, without any.
         command: the command line, for the summary.
+        draw: draw the robot for the report, if it can be drawn here.
 
     Returns:
         The exit code: 0 finished, 1 failed, 2 refused, 130 interrupted.
@@ -218,7 +221,10 @@ def train(
             outcome.reports, bag if bag.is_dir() else None, outcome.interrupted, outcome.failure
         )
         try:
-            results.write(folder, summary, built)
+            draw = draw and not outcome.interrupted and not outcome.failure
+            if draw:
+                progress.log('drawing the robot for the report')
+            results.write(folder, summary, built, draw)
         except OSError as error:
             outcome.failure = '; '.join(filter(None, (outcome.failure, str(error))))
     results.show(built, folder, console(tables=True))
