@@ -150,12 +150,12 @@ def draw(folder: Path, settings: 'Settings', policy: Any) -> str:
 
     torch.set_num_threads(settings.threads)
     environment = tasks.make(settings.task)
-    acting = acting_policy(policy, environment, settings.delay)
+    acting = acting_policy(policy, environment, settings)
     assert acting is not None, 'newest_policy gives none that is random'
     drawn = generator(settings.seed, 'evaluate', 'random', 0)
     actions = uniform_actions(drawn, environment.horizon, environment.action_size)
     start = int(generator(settings.seed, 'evaluate', 0).integers(2**31))
-    runner = EpisodeRunner(environment, settings)
+    runner = EpisodeRunner(environment, settings, 'evaluate')
     steps = settings.steps_after(policy.version)
     rows = {}
     with Drawing(environment, WIDTH, HEIGHT) as drawing:
@@ -185,12 +185,12 @@ def _frames(
 
     The episode is run twice, because its length is not known before.
     """
-    runner.reset(start)
+    runner.reset(start, 0)
     while not runner.over:
         runner.step(act(runner))
     last = runner.length
     due = [round(i * last / (FRAMES - 1)) for i in range(FRAMES)]
-    runner.reset(start)
+    runner.reset(start, 0)
     frames: Moments = []
     for step in due:
         while runner.length < step:
