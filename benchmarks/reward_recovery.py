@@ -51,6 +51,28 @@ VARIANTS: dict[str, dict[str, object]] = {
     'initialisation lecun': {'codetr.initialisation': 'lecun'},
     'head scale one': {'codetr.head_scale': 'one'},
     'pair tokens': {'codetr.tokens': 'pair'},
+    'pair tokens, state first': {'codetr.tokens': 'pair'},
+    'pair tokens, label rhat': {'codetr.tokens': 'pair', 'codetr.label': 'rhat'},
+    'pair tokens, weights one': {'codetr.tokens': 'pair', 'codetr.weights': 'one'},
+    'pair tokens, schedule peaked': {
+        'codetr.tokens': 'pair',
+        'codetr.schedule': 'peaked',
+        'codetr.learning_rate': 1e-4,
+        'codetr.total_gradient_steps': 400,
+    },
+    'pair tokens, lecun, head scale one': {
+        'codetr.tokens': 'pair',
+        'codetr.initialisation': 'lecun',
+        'codetr.head_scale': 'one',
+    },
+    'schedule peaked': {
+        'codetr.schedule': 'peaked',
+        'codetr.learning_rate': 1e-4,
+        'codetr.total_gradient_steps': 400,
+    },
+    'context window': {'codetr.context': 'window'},
+    'base evidence': {'codetr.base': 'evidence'},
+    'base evidence, pair tokens': {'codetr.base': 'evidence', 'codetr.tokens': 'pair'},
     'dropout 0.1': {'codetr.dropout': 0.1},
     'learning rate 3e-4': {'codetr.learning_rate': 3e-4},
     'learning rate 5e-5': {'codetr.learning_rate': 5e-5},
@@ -202,11 +224,14 @@ def memories(
 
 
 def measure(
-    data: dict[str, np.ndarray], settings: Settings, gradient_steps: int
+    data: dict[str, np.ndarray], settings: Settings, gradient_steps: int, state_first: bool = False
 ) -> dict[str, float]:
     """Fit on the training episodes, compare on the held-out ones."""
     train, held_out = memories(data, settings)
     method = registry.make(settings, train.observation_size, train.action_size)
+    if state_first:  # the order of tokens that models of old checkpoints have
+        assert isinstance(method, Codetr)
+        method.network.causal.action_first = False
     method.prepare(train)
     for i in range(gradient_steps):
         seed_torch(settings.seed, 'recovery', i)
@@ -279,7 +304,8 @@ def main() -> None:
                         continue
                     began = time.perf_counter()
                     changes = {'composite': name, 'delay': DELAY, 'seed': seed} | VARIANTS[variant]
-                    row = measure(data, load('quick').changed(changes), steps)
+                    first = variant.endswith('state first')
+                    row = measure(data, load('quick').changed(changes), steps, first)
                     numbers = [f'{value:.3f}' for value in row.values()]
                     line = [*key, *numbers, f'{time.perf_counter() - began:.1f}', commit]
                     with arguments.out.open('a') as file:

@@ -171,5 +171,19 @@ def test_the_gate_opens_by_what_held_out_scores_ask_for_and_seldom_for_noise():
     assert gate(np.empty(0), np.empty(0)) == gate(found, 0 * found) == (0.0, 0.0)
 
 
+def test_verdicts_on_a_scale_of_which_only_the_order_means_anything_are_explained_too():
+    """The level of a verdict is what the regression expects of it."""
+    cuts = np.array([-0.6, 0.0, 0.6])
+    data = planted.memory(
+        planted.progress, lambda r: float(np.searchsorted(cuts, r.mean())), DELAY, segments=100
+    )
+    changes = {'evidence__score_scale': 'ordinal'}
+    alone = made('none', data, 0, method='evidence', **changes)
+    above = made('evidence', data, 10, **changes)
+    batch = data.segments.batch(data.segments.ids())
+    assert above._gate == 0 and np.isfinite(above.gradient_step(data, generator(0))['reward_loss'])
+    assert above.label(batch).tobytes() == alone.label(batch).tobytes()
+
+
 def test_the_registry_makes_it_of_the_setting():
     assert registry.kind(builders.tiny(codetr__base='evidence')) is CodetrOnEvidence

@@ -107,18 +107,19 @@ class CodetrOnEvidence(Codetr):
         for part in self._parts(batch):
             inside = segment_steps(part)
             f = self._base.mean(part)
+            due = self._due(part, f)
             weights, rewards, whole = self.network.heads(*self._inputs(part), self._beside(part))
             own = self._put(inside)
             squares = {
-                'reward_loss': self._squares(part, f, (weights * rewards)[own]),
-                'score_loss': self._squares(part, 0 * f, (weights * whole)[own]),
+                'reward_loss': self._squares(part, due, f, (weights * rewards)[own]),
+                'score_loss': self._squares(part, due, 0 * f, (weights * whole)[own]),
             }
             yield {name: value / len(drawn) for name, value in squares.items()}
 
-    def _squares(self, batch: SegmentBatch, f: F64, u: Tensor) -> Tensor:
-        """The sum of squares of due levels less those of the step rewards f + u (N,)."""
+    def _squares(self, batch: SegmentBatch, due: F64, f: F64, u: Tensor) -> Tensor:
+        """The sum of squares of due levels (b,) less those of the step rewards f + u (N,)."""
         level, slopes = self._levels(batch, f + u.detach().cpu().double().numpy())
-        off = self._put((level - self._due(batch)).astype(np.float32))  # (b,)
+        off = self._put((level - due).astype(np.float32))  # (b,)
         segment = self._put(np.nonzero(segment_steps(batch))[0])  # (N,)
         # F is not torch's: its slopes at f + u make the gradient exact
         along = self._put(slopes.astype(np.float32)) * (u - u.detach())
@@ -131,11 +132,9 @@ class CodetrOnEvidence(Codetr):
         f[inside] = self._base.mean(batch)
         return self._put(f)
 
-    def _due(self, batch: SegmentBatch) -> F64:
-        """The levels (B,) of the scores, in units of the level scale."""
-        model, m = self._base.model, batch.lengths - batch.context
-        due: F64 = model.link.level(batch.values, m) / model.scale
-        return due
+    def _due(self, batch: SegmentBatch, f: F64) -> F64:
+        """The levels (B,) of the scores of segments whose steps have f (N,)."""
+        return self._base.model.due(f, batch.values, batch.lengths - batch.context)
 
     def _levels(self, batch: SegmentBatch, rewards: F64) -> tuple[F64, F64]:
         """The levels (B,) of step rewards (N,), and their slopes (N,)."""
@@ -153,7 +152,7 @@ class CodetrOnEvidence(Codetr):
             w, rhat = self.components(batch)
             u = (w * rhat)[segment_steps(batch)].astype(np.float64)
             single = self._levels(batch, f)[0]
-            left, found = self._due(batch) - single, self._levels(batch, f + u)[0] - single
+            left, found = self._due(batch, f) - single, self._levels(batch, f + u)[0] - single
         self._gate, self._explained = gate(left, found)
 
     # ------------------------------------------------------------------------------------------
@@ -200,9 +199,8 @@ class CodetrOnEvidence(Codetr):
         self._require_prepared()
         w, rhat = self.components(batch)
         u = (w * rhat)[segment_steps(batch)].astype(np.float64)
-        level = self._levels(batch, self._base.mean(batch) + self._gate * u)[0]
-        model = self._base.model
-        return model.link.score(level * model.scale, batch.lengths - batch.context)
+        rewards = self._base.mean(batch) + self._gate * u
+        return self._base.model.scores(rewards, batch.lengths - batch.context)
 
     def metrics(self) -> dict[str, float]:
         """What the regression has to publish, the gate, and what it lets in explains."""

@@ -317,13 +317,15 @@ class Model:
             scores: (S,) of the segments.
             m: (S,) their steps.
         """
-        starts = np.cumsum(m) - m
+        level = self.due(f, scores, m)
+        return f + np.repeat(self.link.shift(f, level, np.cumsum(m) - m, m), m)
+
+    def due(self, f: F64, scores: F64, m: I64) -> F64:
+        """The levels (S,) of scores; of verdicts, those to be expected of steps with rewards f."""
         if self.verdicts is None:
-            level = self.link.level(scores, m) / self.scale
-        else:
-            mean = self.link.forward(f, starts, m)[0]
-            level = self.verdicts.expected(scores, mean, self.verdicts.spread)[0]
-        return f + np.repeat(self.link.shift(f, level, starts, m), m)
+            return self.link.level(scores, m) / self.scale
+        mean = self.link.forward(f, np.cumsum(m) - m, m)[0]
+        return self.verdicts.expected(scores, mean, self.verdicts.spread)[0]
 
     def scores(self, f: F64, m: I64) -> F64:
         """The scores (S,) that step rewards f (N,) let expect, in the task's unit."""
