@@ -152,6 +152,33 @@ def test_a_task_that_only_this_process_knows_is_refused_over_topics(
     assert list(Path.cwd().iterdir()) == []
 
 
+@pytest.mark.usefixtures('built')
+@WAYS
+def test_a_compiler_that_is_not_there_is_refused_before_a_folder_is_made(
+    way: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv('CXX', '/nowhere/g++')
+
+    assert cli.main(['train', '--config', 'cpu', *way]) == 2
+
+    shown = capsys.readouterr().err
+    assert "there is no C++ compiler '/nowhere/g++'" in shown
+    assert 'or set sac.compile=false' in shown
+    assert list(Path.cwd().iterdir()) == []
+
+
+@pytest.mark.usefixtures('built')
+def test_ros_that_is_not_there_is_refused_before_a_folder_is_made(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, 'codetr_ros.ros.watch', None)
+
+    assert cli.main(['train']) == 2
+
+    assert 'ROS cannot be imported' in capsys.readouterr().err
+    assert list(Path.cwd().iterdir()) == []
+
+
 def apart(task: str) -> None:
     settings = load('quick').changed({'task': task, 'delay': 5})
     tryout.tasks.find(task)

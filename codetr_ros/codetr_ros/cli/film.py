@@ -142,13 +142,14 @@ def draw(folder: Path, settings: 'Settings', policy: Any) -> str:
     import torch
 
     from codetr_ros.policy.acting import uniform_actions
-    from codetr_ros.seeding import generator
+    from codetr_ros.seeding import generator, seed_global
     from codetr_ros.simulation import tasks
     from codetr_ros.simulation.drawing import Drawing
     from codetr_ros.simulation.episode import EpisodeRunner
     from codetr_ros.simulation.permission import acting_policy
 
     torch.set_num_threads(settings.threads)
+    seed_global(settings.seed, 'environment')
     environment = tasks.make(settings.task)
     acting = acting_policy(policy, environment, settings)
     assert acting is not None, 'newest_policy gives none that is random'
@@ -156,6 +157,11 @@ def draw(folder: Path, settings: 'Settings', policy: Any) -> str:
     actions = uniform_actions(drawn, environment.horizon, environment.action_size)
     start = int(generator(settings.seed, 'evaluate', 0).integers(2**31))
     runner = EpisodeRunner(environment, settings, 'evaluate')
+
+    def reset() -> None:
+        seed_global(settings.seed, 'environment', 'evaluate', 0)
+        runner.reset(start, 0)
+
     steps = settings.steps_after(policy.version)
     rows = {}
     with Drawing(environment, WIDTH, HEIGHT) as drawing:
@@ -166,7 +172,7 @@ def draw(folder: Path, settings: 'Settings', policy: Any) -> str:
                 lambda episode: acting.act(episode.observation, step=episode.length),
             ),
         ):
-            rows[name] = _frames(runner, start, act, drawing.frame)
+            rows[name] = _frames(runner, reset, act, drawing.frame)
     atomic_write(folder / run_folder.FILM, strip(rows))
     lengths = ', '.join(f'{name} {moments[-1][0]} steps' for name, moments in rows.items())
     return (
@@ -179,21 +185,21 @@ Moments = list[tuple[int, 'Frame']]
 
 
 def _frames(
-    runner: 'EpisodeRunner', start: int, act: Act, frame: Callable[[], 'Frame']
+    runner: 'EpisodeRunner', reset: Callable[[], None], act: Act, frame: Callable[[], 'Frame']
 ) -> Moments:
     """Frames of an episode with their steps: the first, the last, and those between, evenly.
 
     The episode is run twice, because its length is not known before.
     """
-    runner.reset(start, 0)
+    reset()
     while not runner.over:
         runner.step(act(runner))
     last = runner.length
     due = [round(i * last / (FRAMES - 1)) for i in range(FRAMES)]
-    runner.reset(start, 0)
+    reset()
     frames: Moments = []
     for step in due:
-        while runner.length < step:
+        while runner.length < step and not runner.over:  # over: it draws from what has no seed
             runner.step(act(runner))
         frames.append((step, frame().copy()))
     return frames

@@ -1,5 +1,6 @@
 """What the end of a run leaves and shows: summary, report and pictures, and a table of them."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -7,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from codetr_ros.cli import film
+from codetr_ros.processes import launcher
 from codetr_ros.records import (
     Commit,
     CompositeReward,
@@ -83,7 +85,12 @@ def write(folder: Path, summary: Summary, built: RunSummary, draw: bool) -> None
         OSError: one of them cannot be written.
     """
     write_summary(folder, built, summary.metrics_csv(), summary.segments())
-    report.write(folder, built, film.make(folder) if draw else '')
+    report.write(folder, built, _film(folder, summary) if draw else '')
+
+
+def _film(folder: Path, summary: Summary) -> str:
+    module = launcher.module_environment(summary.settings)
+    return film.make(folder, environment={**os.environ, **module})
 
 
 def short(path: Path) -> str:

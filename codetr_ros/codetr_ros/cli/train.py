@@ -10,7 +10,7 @@ import traceback
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -30,6 +30,9 @@ from codetr_ros.runs.progress import Progress
 from codetr_ros.runs.reports import NodeReport
 from codetr_ros.runs.summary import Summary
 from codetr_ros.system.files import atomic_write
+
+if TYPE_CHECKING:
+    from codetr_ros.ros.watch import Watcher
 
 DESCRIPTION = """Train on a task.
 
@@ -144,6 +147,7 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
         if in_process:
             tryout.here(settings)
         else:
+            _watcher(settings)
             tryout.apart(settings, launcher.environment(settings))
         folder = run_folder.create(out) if extra['out'] else run_folder.create_next(out)
     except (
@@ -271,6 +275,25 @@ def _in_process(
         interrupts.raising = False
 
 
+def _watcher(settings: Settings) -> 'type[Watcher]':
+    """What watches the nodes of a run.
+
+    Raises:
+        LaunchError: ROS cannot be imported.
+    """
+    # it lives in this process and must look for the nodes where they are
+    environment = launcher.environment(settings).items()
+    os.environ.update({n: v for n, v in environment if n.startswith(('ROS_', 'RMW_'))})
+    try:
+        from codetr_ros.ros.watch import Watcher
+    except ImportError as error:
+        raise LaunchError(
+            f'ROS cannot be imported ({error}): `codetr doctor` names what is missing; '
+            '--in-process trains without ROS'
+        ) from error
+    return Watcher
+
+
 def _over_topics(
     topics: Topics,
     settings: Settings,
@@ -284,19 +307,7 @@ def _over_topics(
     commands = launcher.commands(
         settings, run_id, folder, namespace=namespace, peer_deadline=topics.peer_deadline
     )
-    environment = launcher.environment(settings)
-    # The watcher lives in this process and must look for the nodes where they are.
-    os.environ.update(
-        {name: v for name, v in environment.items() if name.startswith(('ROS_', 'RMW_'))}
-    )
-    try:
-        from codetr_ros.ros.watch import Watcher
-    except ImportError as error:
-        return Outcome(
-            {},
-            failure=f'ROS cannot be imported ({error}): `codetr doctor` names what is missing; '
-            '--in-process trains without ROS',
-        )
+    watch = _watcher(settings)
     silence = Silence()
 
     def receive(record: Record) -> None:
@@ -309,13 +320,13 @@ def _over_topics(
     with launcher.Processes(progress.log, asked, start_program=topics.start) as processes:
         try:
             # The watcher comes first, so as to receive everything from the nodes' start on.
-            with Watcher(receive, namespace) as watcher:
+            with watch(receive, namespace) as watcher:
 
                 def poll() -> None:
                     watcher.poll(0.1)
                     progress.tick()
 
-                processes.start(commands, folder / run_folder.LOGS, environment)
+                processes.start(commands, folder / run_folder.LOGS, launcher.environment(settings))
                 failure = supervise(
                     processes,
                     poll,

@@ -22,6 +22,7 @@ from codetr_ros.simulation.chunks import steps_of_chunks
 from codetr_ros.simulation.composite import CompositeError
 from codetr_ros.simulation.episode import EpisodeRunner
 from codetr_ros.simulation.tasks import TASKS, TaskError
+from codetr_ros.system import compilation
 
 LIBRARIES = {'gymnasium': ('gymnasium', 'mujoco'), 'dm_control': ('dm_control', 'mujoco')}
 """The packages that the named tasks of a library need."""
@@ -44,6 +45,7 @@ def here(settings: Settings) -> None:
         TryoutError: its nodes would fail.
         SettingsError: the delay exceeds the task's horizon.
     """
+    _compiler(settings)
     try:
         _devices(settings)
         if settings.task in TASKS:
@@ -52,6 +54,14 @@ def here(settings: Settings) -> None:
             _environment(settings)
     except (TaskError, CompositeError) as error:
         raise TryoutError(str(error)) from error
+
+
+def _compiler(settings: Settings) -> None:
+    if settings.sac.compile and settings.labels_steps:
+        try:
+            compilation.check('sac.compile=false')
+        except compilation.CompilationError as error:
+            raise TryoutError(str(error)) from error
 
 
 def _devices(settings: Settings) -> None:
@@ -100,6 +110,7 @@ def apart(settings: Settings, environ: Mapping[str, str]) -> None:
     Raises:
         TryoutError: its nodes would fail.
     """
+    _compiler(settings)
     if settings.task in TASKS and settings.device == settings.reward_device == 'cpu':
         _libraries(settings.task)
         return

@@ -125,12 +125,14 @@ def environment(settings: Settings, environ: Mapping[str, str] = os.environ) -> 
         'PYTHONUNBUFFERED': '1',
         **environ,
         **threading_environment(settings),
-        **_module_environment(settings, environ),
+        **module_environment(settings, environ),
     }
 
 
-def _module_environment(settings: Settings, environ: Mapping[str, str]) -> dict[str, str]:
-    """The variable with which the nodes find the module of a task `module:id`, as this process
+def module_environment(
+    settings: Settings, environ: Mapping[str, str] = os.environ
+) -> dict[str, str]:
+    """The variable with which another process finds the module of a task `module:id`, as this one
     did.
     """
     module = modules.of_task(settings.task)

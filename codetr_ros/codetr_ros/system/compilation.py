@@ -49,6 +49,20 @@ def missing() -> str:
     return ''
 
 
+def check(without: str) -> None:
+    """Check that something can be compiled here, as far as that is known beforehand.
+
+    Args:
+        without: the setting, with its value, that avoids compiling: for the error.
+
+    Raises:
+        CompilationError: a compiler or a header is missing.
+    """
+    lacking = missing()
+    if lacking:
+        raise CompilationError(f'{lacking}: {REMEDY}, or set {without}')
+
+
 def compiled(function: _Function, example: Sequence[Any], without: str) -> _Function:
     """The same function, compiled for arguments of the shapes of an example.
 
@@ -61,9 +75,7 @@ def compiled(function: _Function, example: Sequence[Any], without: str) -> _Func
         CompilationError: a compiler or a header is missing, the compiler failed, or the result
             cannot be kept.
     """
-    lacking = missing()
-    if lacking:
-        raise CompilationError(f'{lacking}: {REMEDY}, or set {without}')
+    check(without)
     _make_cache(without)
     os.environ.setdefault(_CACHE, str(cache_folder()))
     import torch
