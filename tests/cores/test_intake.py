@@ -66,6 +66,10 @@ NAN = np.array([[0, 0, 0]] * 3 + [[0, np.nan, 0]] + [[0, 0, 0]] * 2, np.float32)
         (transitions(source='stranger'), "'stranger' is no simulator of this run; these are: sim"),
         (transitions(sequence=400), "out of sequence: .* 0 is the next of 'sim'"),
         (score(value=float('nan')), 'value is nan: a composite reward must be finite'),
+        (
+            score(value=-1e101),
+            'value is -1e.101: a composite reward must be from -1e.100 to 1e.100',
+        ),
         (score(length=8), 'length is 8: a segment has 1 to 7 steps'),
         (score(length=0), 'length is 0'),
         (score(run_id='other'), "is of run 'other'"),

@@ -24,6 +24,18 @@ def test_the_scale_and_the_moments_are_those_of_what_is_held():
     np.testing.assert_allclose(deviation, before.std(0), rtol=1e-5)
 
 
+@pytest.mark.parametrize('size', [1e-200, 1e-300])
+def test_scores_whose_squares_are_no_numbers_have_a_scale_too(size):
+    scales = []
+    for factor in (1.0, size):
+        naive, m = Naive(0), memory()
+        m.append(naive.chunk('sim', 3 * DELAY, 'truncated'))
+        for i, value in enumerate((1.0, -2.0, 3.0)):
+            m.score(builders.score(first_step=i * DELAY, length=DELAY, value=value * factor))
+        scales.append(m.segments.score_scale())
+    assert scales[1] == pytest.approx(scales[0] * size, rel=1e-12)
+
+
 def test_the_memory_takes_the_bytes_it_states():
     naive, m = Naive(0), memory(capacity=100, margin=100)
     m.append(naive.chunk('sim', 100, 'truncated'))

@@ -5,11 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from codetr_ros.bags.reader import Bag
 from codetr_ros.offline import fitting
 from codetr_ros.offline.episodes import Index, stretches
 from codetr_ros.offline.errors import FitError
+from codetr_ros.offline.judging import judge
 from codetr_ros.offline.loading import load, newest
 from codetr_ros.offline.settings import FitSettings
 from codetr_ros.records import CompositeReward, TrueRewards
@@ -91,6 +93,39 @@ def test_true_rewards_that_a_bag_has_not_are_nan_not_numbers(tmp_path):
     )
 
     assert np.isnan(batch.true_rewards).all()
+
+
+@pytest.mark.parametrize('power', [300, 100, -450, -600])
+def test_scores_of_any_size_teach_the_same(tmp_path, power):
+    """The size is a power of two, so that no bit but those of the exponent differs."""
+    states = []
+    for factor in (1.0, 2.0**power):
+        scored = [
+            replace(r, value=r.value * factor) if isinstance(r, CompositeReward) else r
+            for r in records(12)
+        ]
+        bag = Bag(write(tmp_path / f'bag {factor}', scored))
+        plan = fitting.plan(stretches(Index([bag]).read(), DELAY, 10_000).usable, tiny(), how())
+        fitted = fitting.fit([bag], plan, SIZES, tiny(method='mlp'), how(), lambda check: None)
+        judged = judge(fitted.method, fitted.held_out)
+        states.append((fitted.method.state(), judged.metrics['composite_r2']))
+    (plain, r2), (scaled, scaled_r2) = states
+    scale = float(plain['target_scale'])
+    assert float(scaled['target_scale']) == pytest.approx(scale * factor, rel=1e-12)
+    for name in plain.keys() - {'target_scale'}:
+        # the squares of the smallest underflow: their scale is found in another way
+        assert torch.allclose(plain[name], scaled[name], rtol=1e-3, atol=1e-5), name
+        assert power == -600 or torch.equal(plain[name], scaled[name]), name
+    assert scaled_r2 == pytest.approx(r2, rel=1e-4)
+
+
+def test_a_score_beyond_all_measure_is_left_out_and_counted(tmp_path):
+    plain = [r for r in records(3) if not isinstance(r, TrueRewards)]
+    first = next(i for i, r in enumerate(plain) if isinstance(r, CompositeReward))
+    plain[first] = replace(plain[first], value=-1e300)
+    index = Index([Bag(write(tmp_path / 'bag', plain))]).read()
+    assert index.scores == 11
+    assert index.skipped == {'scores beyond 1e+100': 1}
 
 
 def test_a_bag_that_has_changed_since_it_was_indexed_is_refused(tmp_path):

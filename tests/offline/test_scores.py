@@ -65,6 +65,14 @@ def book(
     score: dict[str, Any], *messages: Message, episode: dict[str, Any] | None = None
 ) -> tuple[list[tuple[int, int, int, float]], dict[str, int]]:
     """Scores (episode, first step, length, value) of messages, and what was dropped."""
+    ordered = sorted(messages, key=lambda message: message.log_time)
+    return book_in_order(score, *ordered, episode=episode)
+
+
+def book_in_order(
+    score: dict[str, Any], *messages: Message, episode: dict[str, Any] | None = None
+) -> tuple[list[tuple[int, int, int, float]], dict[str, int]]:
+    """The same, of messages in the order of a bag."""
     plain = {
         'observation': [{'topic': '/state', 'fields': ['data']}],
         'action': {'topic': '/command', 'fields': ['data']},
@@ -72,8 +80,7 @@ def book(
         'episode': {'topic': '/end'} if episode is None else episode,
     }
     converter = Converter(validate(Mapping, plain, 'test'), 'run')
-    ordered = sorted(messages, key=lambda message: message.log_time)
-    records = [r for message in ordered for r, _ in converter.feed(message)]
+    records = [r for message in messages for r, _ in converter.feed(message)]
     records += [r for r, _ in converter.finish()]
     scores = [
         (r.episode, r.first_step, r.length, r.value)
@@ -198,6 +205,24 @@ def test_a_correction_may_come_when_the_next_attempt_has_begun():
     )
     assert scores == [(0, 0, 4, 2.0)]
     assert dropped == {conversion.SCORE_REPLACED: 1}
+
+
+@pytest.mark.parametrize('value', [np.nan, np.inf, -1e300])
+def test_a_score_that_cannot_be_used_is_dropped_and_leaves_its_steps_to_no_other(value):
+    verdicts = [verdict(1.15, value), verdict(1.35, 2.0), verdict(11.35, 3.0)]
+    scores, dropped = book({}, *attempts(2), *verdicts)
+    assert scores == [(0, 2, 2, 2.0), (1, 0, 4, 3.0)]
+    finite = np.isfinite(value)
+    assert dropped == {conversion.SCORE_TOO_LARGE if finite else conversion.SCORE_NOT_FINITE: 1}
+
+
+@pytest.mark.parametrize('again', ['first', 'replace'])
+@pytest.mark.parametrize('values', [(np.nan, 2.0), (2.0, np.nan)])
+def test_a_score_that_cannot_be_used_never_counts_as_the_first_or_the_second(again, values):
+    verdicts = [verdict(2.0 + i, value) for i, value in enumerate(values)]
+    scores, dropped = book({'again': again}, *attempts(1), *verdicts)
+    assert scores == [(0, 0, 4, 2.0)]
+    assert dropped == {conversion.SCORE_NOT_FINITE: 1}
 
 
 # ------------------------------------------------------------------------------------------
@@ -374,6 +399,15 @@ def test_a_stamp_ahead_of_the_reception_waits_for_its_steps():
     scores, dropped = book({'stamp': 'stamp'}, *attempts(1), *verdicts)
     assert scores == [(0, 0, 4, 1.0)]
     assert dropped == {conversion.SCORE_AHEAD: 1}
+
+
+def test_a_stamp_of_a_clock_that_went_back_is_not_taken_for_one_of_the_new_clock():
+    """Each attempt begins at 1 s of its clock; the verdict on the first comes in the second."""
+    again = [*attempts(1), verdict(1.05, 1.0, stamp=stamp(1.4))]
+    messages = [*attempts(1), *sorted(again, key=lambda m: m.log_time)]
+    scores, dropped = book_in_order({'of': 'episode', 'stamp': 'stamp'}, *messages)
+    assert scores == []
+    assert dropped[conversion.SCORE_OF_EITHER] == 1
 
 
 @pytest.mark.parametrize('value', [1_350_000_000, np.int64(1_350_000_000), 1.35, stamp(1.35)])

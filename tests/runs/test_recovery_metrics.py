@@ -6,6 +6,17 @@ from codetr_ros.runs.recovery_metrics import r_squared, step_recovery
 ALL = np.ones((2, 3), bool)
 
 
+@pytest.mark.parametrize('size', [1e150, 1e-150, 1e-200, 1e-300, -1e-200])
+def test_r_squared_does_not_depend_on_the_size_of_scores(size):
+    true, predicted = np.array([1.0, 2.0, 6.0]), np.array([1.5, 2.0, 3.0])
+    assert r_squared(predicted * size, true * size) == pytest.approx(r_squared(predicted, true))
+
+
+@pytest.mark.parametrize('value', [0.1, 1 / 3, 1e-9, 1e9 + 0.1])
+def test_equal_scores_have_no_variance_although_their_mean_is_rounded(value):
+    assert np.isnan(r_squared(np.arange(24.0), np.full(24, value)))
+
+
 def test_r_squared_is_1_for_the_truth_0_for_its_mean_and_nan_where_nothing_varies():
     true = np.array([1.0, 2.0, 6.0])
     assert r_squared(true, true) == 1

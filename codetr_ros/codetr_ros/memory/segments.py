@@ -118,7 +118,16 @@ class Segments:
         squares = [s.scored.per_step() ** 2 for s in self._store.sources]
         values = np.concatenate(squares) if squares else np.empty(0)
         scale = float(np.sqrt(values.mean())) if len(values) else 0.0
-        return scale if scale > 0 else 1.0
+        return scale if scale > 0 else self._tiny_scale()
+
+    def _tiny_scale(self) -> float:
+        """The scale of scores whose squares are too small for a float64; 1 where all are 0."""
+        parts = [s.scored.per_step() for s in self._store.sources]
+        values = np.concatenate(parts) if parts else np.empty(0)
+        largest = float(np.abs(values).max(initial=0.0))
+        if not largest:
+            return 1.0
+        return largest * float(np.sqrt(np.mean((values / largest) ** 2)))
 
     # ------------------------------------------------------------------------------------------
     # where they lie

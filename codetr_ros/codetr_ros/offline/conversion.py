@@ -3,7 +3,10 @@
 from collections import Counter
 from dataclasses import dataclass, field
 
+from codetr_ros.records.checks import LARGEST_SCORE
+
 SCORE_NOT_FINITE = 'scores that are not finite'
+SCORE_TOO_LARGE = f'scores beyond {LARGEST_SCORE:g}'
 SCORE_OF_NOTHING = 'scores of no step, or of fewer than are asked for'
 SCORE_AGAIN = 'scores of steps that were scored before'
 SCORE_SECOND = 'second scores of the same steps, the first was kept'

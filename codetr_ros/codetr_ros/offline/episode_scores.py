@@ -17,6 +17,7 @@ from codetr_ros.offline.message_fields import NS, moment, name_in, number
 from codetr_ros.offline.score_booking import Booking, Held, Verdict
 from codetr_ros.offline.scored_episode import ScoredEpisode
 from codetr_ros.records import CompositeReward
+from codetr_ros.records.checks import usable_score
 
 
 class EpisodeScores:
@@ -136,9 +137,10 @@ class EpisodeScores:
         """
         rule, topic, content = self._rule, message.topic, message.message
         value = number(content, rule.field, topic)
-        if not np.isfinite(value):
-            self._drop(conversion.SCORE_NOT_FINITE)
-            return
+        if not usable_score(value):
+            finite = np.isfinite(value)
+            self._drop(conversion.SCORE_TOO_LARGE if finite else conversion.SCORE_NOT_FINITE)
+            value = float('nan')  # yet its steps have had their score
         at = now if rule.stamp is None else moment(content, rule.stamp, topic) + self._shift
         begin = at - round((rule.seconds or 0.0) * NS)
         if rule.begin is not None:
@@ -148,7 +150,7 @@ class EpisodeScores:
         if name is not None:
             self._named.setdefault(name, []).append(verdict)
         elif at > now and self._shift:  # stamped before the clock went back, most likely
-            self._drop(conversion.SCORE_OF_EITHER)
+            self._count(conversion.SCORE_OF_EITHER, verdict)
         elif at > now:
             self._ahead.append(verdict)
         else:
@@ -169,19 +171,27 @@ class EpisodeScores:
             shift: what to add to the new times [ns], so that they follow those before.
         """
         self._shift = shift
-        self._drop(conversion.SCORE_AHEAD, len(self._ahead))
-        self._ahead = []
+        self._forget_ahead()
 
     def finish(self) -> Iterator[CompositeReward]:
         """Yield the scores that are still held: no more can come."""
-        self._drop(conversion.SCORE_AHEAD, len(self._ahead))
+        self._forget_ahead()
         for episode in self._held.episodes:
             yield from self._close(episode)
-        self._drop(conversion.SCORE_WITHOUT_EPISODE, sum(map(len, self._named.values())))
+        for verdicts in self._named.values():
+            for verdict in verdicts:
+                self._count(conversion.SCORE_WITHOUT_EPISODE, verdict)
+
+    def _forget_ahead(self) -> None:
+        for verdict in self._ahead:
+            self._count(conversion.SCORE_AHEAD, verdict)
+        self._ahead = []
 
     def _book(self, verdict: Verdict) -> None:
-        fault = self._booking.book(verdict)
-        if fault is not None:
+        self._count(self._booking.book(verdict), verdict)
+
+    def _count(self, fault: str | None, verdict: Verdict) -> None:
+        if fault is not None and not np.isnan(verdict.value):  # NaN was counted
             self._drop(fault)
 
     def _book_waiting(self) -> None:
@@ -225,8 +235,7 @@ class EpisodeScores:
             fault: str | None = conversion.SCORE_OF_NAMESAKES
             if self._names[episode.name] == 1:
                 fault = self._booking.book_whole(episode, verdict)
-            if fault is not None:
-                self._drop(fault)
+            self._count(fault, verdict)
 
 
 def _horizon(rules: Mapping) -> float:

@@ -19,6 +19,7 @@ from codetr_ros.config import Settings, SettingsError, load
 from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.sources import settings_of
 from codetr_ros.records import CompositeReward, RunSpec, TaskSpec, Transitions
+from codetr_ros.records.checks import LARGEST_SCORE, usable_score
 
 UNKNOWN_TASK = 'unknown'
 """The task in the settings of a fit whose bags name none."""
@@ -28,6 +29,7 @@ COPIES = 'steps of episodes that another bag holds too'
 UNSOUND = 'steps with values that are not finite'
 UNJOINED = 'breaks where the next observation is not the one before'
 NOT_FINITE = 'scores that are not finite'
+TOO_LARGE = f'scores beyond {LARGEST_SCORE:g}'
 NO_STEPS = 'scores of steps that are not all there'
 OVERLAP = 'scores of steps that another score covers'
 TOO_LONG = 'scores of more steps than the delay'
@@ -229,8 +231,8 @@ class Index:
         return True
 
     def _score(self, key: Key, reward: CompositeReward) -> None:
-        if not np.isfinite(reward.value):
-            self.skipped[NOT_FINITE] += 1
+        if not usable_score(reward.value):
+            self.skipped[TOO_LARGE if np.isfinite(reward.value) else NOT_FINITE] += 1
             return
         place = (key, reward.episode)
         if place in self._copies:

@@ -26,7 +26,7 @@ class Judgement:
     metrics: dict[str, float | None]
     values: F64  # (S,) composite rewards
     predicted: F64 | None  # (S,) as predicted by the model; None for rules
-    labels: F32  # steps whose true rewards are known, one after the other
+    labels: F64  # steps whose true rewards are known, one after the other
     true: F32
     shown: list[Segment]
 
@@ -45,7 +45,7 @@ def judge(method: RewardMethod, loaded: Loaded) -> Judgement:
     memory = loaded.memory
     ids = memory.segments.ids()
     values = memory.segments.scores(ids)
-    labels = labels_of(method, loaded, ids) * np.float32(method.unit)
+    labels = labels_of(method, loaded, ids) * np.float64(method.unit)
     true = true_rewards_of(loaded, ids)
     inside = ~np.isnan(labels)
     known = np.asarray((np.isfinite(true) | ~inside).all(1))
@@ -94,7 +94,7 @@ def _shown(
     method: RewardMethod,
     loaded: Loaded,
     ids: I64,
-    labels: F32,
+    labels: F64,
     true: F32,
     known: np.ndarray[Any, Any],
     predicted: F64 | None,

@@ -24,6 +24,9 @@ from codetr_ros.system.parsing import ParseError, read_json
 
 DIGEST = 'reward_model_sha256'
 
+WORST = 1000
+"""Explained parts of a variance are shown down to minus this."""
+
 
 def make_folder(path: Path) -> Path:
     """Make the folder of a fit; returns its absolute path.
@@ -183,15 +186,17 @@ def rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     else:
         facts.append(('ended', summary['stopped']))
     metrics = summary['metrics']
-    for name, key in (
-        ('composite R²', 'composite_r2'),
-        ('Pearson', 'pearson'),
-        ('Pearson within segments', 'within_pearson'),
-        ('Spearman', 'spearman'),
-    ):
-        value = metrics[key]
-        shown = 'not known' if value is None else f'{value:.3f} {summary["judged_on"]}'
-        facts.append((name, shown))
+    facts.append(('composite R²', _explained(metrics['composite_r2'], summary['judged_on'])))
+    known = [
+        (name, f'{metrics[key]:.3f} {summary["judged_on"]}')
+        for name, key in (
+            ('Pearson', 'pearson'),
+            ('Pearson within segments', 'within_pearson'),
+            ('Spearman', 'spearman'),
+        )
+        if metrics[key] is not None
+    ]
+    facts += known or [('step rewards', 'cannot be judged: no true ones are known')]
     skipped = sum(summary['skipped'].values())
     what = f': {", ".join(f"{n} {name}" for name, n in summary["skipped"].items())}'
     return [
@@ -201,6 +206,16 @@ def rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ('time', f'{summary["wall_s"]:.1f} s'),
         ('peak memory', f'{summary["peak_rss_mb"]:.0f} MB'),
     ]
+
+
+def _explained(r2: float | None, where: str) -> str:
+    """The part of the variance of scores that a model explains, for people."""
+    if r2 is None:
+        return 'not known: the scores do not differ, or the method predicts none'
+    if r2 >= 0:
+        return f'{r2:.3f} {where}'
+    amount = f'{r2:.3f}' if r2 > -WORST else f'below -{WORST}'
+    return f'{amount} {where}: worse than their mean score would be'
 
 
 def show(summary: Mapping[str, Any], folder: Path, console: Console) -> None:

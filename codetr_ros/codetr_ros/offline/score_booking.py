@@ -4,6 +4,7 @@ Reception alone cannot show which episode a score is of when it comes after the 
 one had no score: such a score is dropped, unless the mapping defines how late scores may be.
 """
 
+import math
 from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -11,13 +12,13 @@ from typing import NamedTuple
 from codetr_ros.offline import conversion
 from codetr_ros.offline.message_fields import NS
 from codetr_ros.offline.score_rules import Score
-from codetr_ros.offline.scored_episode import WHOLE, ScoredEpisode, Segment
+from codetr_ros.offline.scored_episode import WHOLE, ScoredEpisode, ScoredSteps
 
 
 class Verdict(NamedTuple):
     """A score, as a message carries it."""
 
-    value: float
+    value: float  # NaN: one that cannot be used
     at: int  # its time [ns]: of its stamp, or of its reception
     received: int  # [ns]
     begin: int = 0  # of its window [ns]
@@ -28,7 +29,7 @@ class _Latest(NamedTuple):
     """The score that was booked or dropped last."""
 
     at: int  # [ns]
-    segment: Segment | None  # that it was booked on
+    segment: ScoredSteps | None  # that it was booked on
     fault: str | None = None  # why it was dropped
 
 
@@ -199,9 +200,12 @@ class Booking:
         return late is not None and end is not None and verdict.received - end > late * NS
 
 
-def _again(segment: Segment, verdict: Verdict, again: str) -> str:
+def _again(segment: ScoredSteps, verdict: Verdict, again: str) -> str | None:
     """Take a second score of the same steps; returns what to count."""
-    if again == 'first':
+    if math.isnan(segment.value):
+        segment.value = verdict.value
+        return None
+    if again == 'first' or math.isnan(verdict.value):
         return conversion.SCORE_SECOND
     segment.value = verdict.value
     return conversion.SCORE_REPLACED

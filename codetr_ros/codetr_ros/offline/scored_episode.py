@@ -1,5 +1,6 @@
 """An episode that is being converted, with the scores of its steps."""
 
+import math
 from array import array
 from bisect import bisect_left, bisect_right
 from collections import Counter
@@ -13,12 +14,12 @@ WHOLE = 1 << 62
 
 
 @dataclass(slots=True)
-class Segment:
+class ScoredSteps:
     """Steps of an episode, and their score."""
 
     first: int
     length: int
-    value: float
+    value: float  # NaN: it had a score that cannot be used
 
 
 @dataclass(eq=False)
@@ -43,7 +44,7 @@ class ScoredEpisode:
     answered: int = 0  # its steps before this one have had their score
     # the begins of its steps, where scores need them: these are 8 bytes a step
     times: 'array[int]' = field(default_factory=lambda: array('q'))
-    segments: list[Segment] = field(default_factory=list)  # in the order of their steps
+    segments: list[ScoredSteps] = field(default_factory=list)  # in the order of their steps
 
     def begin_step(self, now: int, timed: bool) -> None:
         """Begin a step.
@@ -82,13 +83,13 @@ class ScoredEpisode:
         """
         return bisect_left(self.times, begin), bisect_left(self.times, end)
 
-    def segment(self, first: int, length: int) -> Segment | None:
+    def segment(self, first: int, length: int) -> ScoredSteps | None:
         """Its score of exactly these steps."""
         at = bisect_left(self.segments, first, key=lambda s: s.first)
         mine = self.segments[at : at + 1]
         return mine[0] if mine and (mine[0].first, mine[0].length) == (first, length) else None
 
-    def add(self, first: int, length: int, value: float) -> Segment | None:
+    def add(self, first: int, length: int, value: float) -> ScoredSteps | None:
         """Add a score; None where a step of it has one already."""
         at = bisect_left(self.segments, first, key=lambda s: s.first)
         before = self.segments[at - 1] if at else None
@@ -97,12 +98,12 @@ class ScoredEpisode:
             after and first + length > after.first
         ):
             return None
-        made = Segment(first, length, value)
+        made = ScoredSteps(first, length, value)
         self.segments.insert(at, made)
         self.answered = max(self.answered, first + length)
         return made
 
-    def sound(self, trim: bool, dropped: 'Counter[str]') -> Iterator[Segment]:
+    def sound(self, trim: bool, dropped: 'Counter[str]') -> Iterator[ScoredSteps]:
         """Its scores, when it has ended.
 
         Args:
@@ -110,14 +111,16 @@ class ScoredEpisode:
             dropped: counts both.
         """
         for segment in self.segments:
+            if math.isnan(segment.value):
+                continue  # it was counted
             there = min(segment.length, self.steps - segment.first)
             whole = segment.length == WHOLE
             if whole and not self.whole:
                 dropped[conversion.SCORE_OF_PART] += 1
             elif there == segment.length or (whole and there > 0):
-                yield Segment(segment.first, there, segment.value)
+                yield ScoredSteps(segment.first, there, segment.value)
             elif trim and there > 0:
                 dropped[conversion.SCORE_TRIMMED] += 1
-                yield Segment(segment.first, there, segment.value)
+                yield ScoredSteps(segment.first, there, segment.value)
             else:
                 dropped[conversion.SCORE_DROPPED] += 1

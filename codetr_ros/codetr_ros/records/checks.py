@@ -56,6 +56,15 @@ def check_transitions(chunk: Transitions, spec: TaskSpec) -> None:
         )
 
 
+LARGEST_SCORE = 1e100
+"""The largest amount of a composite reward: squares of larger ones have no float64 any more."""
+
+
+def usable_score(value: float) -> bool:
+    """Whether a composite reward can be computed with: it is finite and not beyond all measure."""
+    return abs(value) <= LARGEST_SCORE
+
+
 def check_score(reward: CompositeReward, delay: int) -> None:
     """Refuse a composite reward that no segment can have.
 
@@ -65,6 +74,11 @@ def check_score(reward: CompositeReward, delay: int) -> None:
     if not np.isfinite(reward.value):
         raise RecordError(
             f'{describe(reward)}: value is {reward.value}: a composite reward must be finite'
+        )
+    if not usable_score(reward.value):
+        raise RecordError(
+            f'{describe(reward)}: value is {reward.value}: a composite reward must be from '
+            f'-{LARGEST_SCORE:g} to {LARGEST_SCORE:g}'
         )
     if not 1 <= reward.length <= delay:
         raise RecordError(

@@ -9,13 +9,22 @@ from scipy import stats
 
 
 def r_squared(predicted: ArrayLike, true: ArrayLike) -> float:
-    """The part of the variance of `true` that `predicted` explains: 1 - residual / total."""
+    """The part of the variance of `true` that `predicted` explains: 1 - residual / total.
+
+    NaN where `true` has no variance but that of rounding.
+    """
     expected = np.asarray(true, np.float64)
     residual = np.asarray(predicted, np.float64) - expected
     if not len(expected):
         return float('nan')
-    total = float(((expected - expected.mean()) ** 2).sum())
-    return 1 - float((residual**2).sum()) / total if total > 0 else float('nan')
+    centred = expected - expected.mean()
+    spread = float(np.abs(centred).max())
+    if spread <= 4 * np.finfo(np.float64).eps * float(np.abs(expected).max()):
+        return float('nan')
+    total = float((centred**2).sum())
+    if not total > np.finfo(np.float64).tiny:  # the squares are too small: use larger units
+        residual, total = residual / spread, float(((centred / spread) ** 2).sum())
+    return 1 - float((residual**2).sum()) / total
 
 
 def step_recovery(

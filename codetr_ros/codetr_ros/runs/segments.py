@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from codetr_ros.records import F32
+from codetr_ros.records import F32, F64
 from codetr_ros.runs.folder import RunFolderError
 
 SHOWN = 6
@@ -36,7 +36,7 @@ class Segment:
     episode: int
     first: int
     value: float | None
-    labels: F32
+    labels: F32 | F64
     true: F32 | None
     predicted: float | None = None
     weights: F32 | None = None
