@@ -1,10 +1,13 @@
 """The nodes of a run in one namespace: `ros2 launch codetr_ros train.launch.py config:=quick`.
 
 The settings of the run decide which nodes it needs. They start in any order and wait for each
-other. The launch ends with the recorder, which is the last node to end. It starts one simulator: a
-run with the setting `simulators` above 1 waits until the others are started by hand, each with a
+other. The launch ends with the recorder, which is the last node to end. If a node fails, the
+launch ends the others and returns an exit code other than 0. It starts one simulator: a run with
+the setting `simulators` above 1 waits until the others are started by hand, each with a
 name of its own, `ros2 run sim_node sim --ros-args -r __ns:=/codetr -r __node:=sim_2`.
 """
+
+import signal
 
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
 from launch.actions import (
@@ -15,6 +18,7 @@ from launch.actions import (
 )
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
+from launch.events.process import ProcessExited
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
@@ -28,6 +32,30 @@ ARGUMENTS = {
     'folder': ('', 'folder for bag, checkpoints and reports; empty: nothing is written'),
     'peer_deadline': ('60.0', 'seconds that nodes wait for each other'),
 }
+STOP_DEADLINE = '20'
+"""Seconds from SIGINT to SIGTERM, and from there to SIGKILL, in which a node ends its slice and
+writes a checkpoint.
+"""
+
+
+class NodeFailedError(RuntimeError):
+    """A node of the run has failed. Of all that a launch file can do, only an error makes `ros2
+    launch` return another exit code than 0.
+    """
+
+
+def check(event: ProcessExited, context: LaunchContext) -> None:
+    """End the launch with an error if a node has failed.
+
+    Raises:
+        NodeFailedError: it has an exit code other than 0, and was not merely ended by the SIGINT
+            that ends a launch.
+    """
+    stopped = context.is_shutdown and event.returncode == -signal.SIGINT
+    if event.returncode and not stopped:
+        code = event.returncode
+        how = f'ended with exit code {code}' if code > 0 else f'was ended by signal {-code}'
+        raise NodeFailedError(f'{event.process_name} {how}: the run has failed, see its output')
 
 
 def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
@@ -41,6 +69,8 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             name=TABLE[role].executable,
             namespace=value['namespace'],
             output='screen',
+            sigterm_timeout=STOP_DEADLINE,
+            sigkill_timeout=STOP_DEADLINE,
             parameters=[shared | ({'config': value['config']} if role == 'learner' else {})],
         )
         for role in load(value['config'].perform(context)).roles
@@ -51,7 +81,11 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             on_exit=[EmitEvent(event=Shutdown(reason='the run is over'))],
         )
     )
-    return [*processes.values(), end]
+    failed = [
+        RegisterEventHandler(OnProcessExit(target_action=process, on_exit=check))
+        for process in processes.values()
+    ]
+    return [*failed, end, *processes.values()]
 
 
 def generate_launch_description() -> LaunchDescription:

@@ -18,7 +18,7 @@ def load() -> 'MakeCore':
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; the imports follow the signal handlers, since they take seconds."""
-    stop = Stop().install()
+    stop = Stop().install(starting=True)
     from codetr_ros.ros.node import run_node
 
     return run_node('sim', 'sim', load, argv, stop)

@@ -69,10 +69,13 @@ class Nodes:
         """The role of a node."""
         return self._commands[name].role
 
-    def start(self, name: str, *parameters: str) -> None:
-        """Start a node, with parameters such as `delay:=9` beside those of `codetr train`."""
+    def start(self, name: str, *parameters: str, file: Path | None = None) -> None:
+        """Start a node, with parameters such as `delay:=9` beside those of `codetr train`, or with
+        a parameter file.
+        """
         made = self._commands[name]
         more = [word for parameter in parameters for word in ('-p', parameter)]
+        more += ['--params-file', str(file)] if file else []
         command = launcher.Command(name, made.role, (*made.arguments, *more))
         self._processes.start([command], self.folder / run_folder.LOGS, self._environment)
 

@@ -18,6 +18,7 @@ MODULES = {
     'learner': 'learner_node.learner',
     'reward': 'reward_node.reward',
     'deaf': 'helpers.deaf',
+    'slow': 'helpers.slow_import',
 }
 NAMESPACE = '/r'
 PATIENCE = 60.0  # discovery and imports on a busy machine

@@ -99,9 +99,9 @@ def test_a_node_gives_up_on_what_was_lost_for_good_naming_topic_and_count(play):
     [(61.0, 60.0, {}), (59.0, 60.0, {'commits': 1}), (1e6, 0.0, {'commits': 1})],
     ids=['nothing is lost', 'it may still come', 'for ever'],
 )
-def test_waiting_is_not_pointless_as_long_as(waiting, deadline, lost):
-    patience = Patience('/r/learner', 'learner', ['commits'], Peers('learner'), deadline, None)
-    patience.check(1e6, waiting, 'waits', lost)
+def test_waiting_is_not_pointless_as_long_as(member, waiting, deadline, lost):
+    member.values['peer_deadline'] = deadline
+    Patience(member, ['commits']).check(1e6, waiting, 'waits', lost)
 
 
 class Core:

@@ -5,7 +5,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from codetr_ros.config import Settings, load
-from codetr_ros.ros import parameters
+from codetr_ros.ros import given, parameters
 
 
 @pytest.fixture
@@ -62,15 +62,43 @@ def test_ranges_and_choices_come_from_the_configuration():
 
 def test_an_unknown_parameter_is_refused_with_its_name_and_value(make_node):
     with pytest.raises(
-        parameters.ParameterError, match='/r/n has no parameter dealy=7. There are: .*delay'
+        parameters.ParameterError,
+        match=r'/r/n has no parameter dealy=7 \(did you mean delay\?\). There are: .*delay',
     ):
-        parameters.check_names(make_node(dealy=7), 'learner')
+        given.check_names(make_node(dealy=7), 'learner', ['--ros-args', '-p', 'dealy:=7'])
 
 
 def test_a_parameter_of_another_role_is_unknown(make_node):
+    arguments = ['-p', 'n:bag:=x', '-p', 'use_sim_time:=true']
     with pytest.raises(parameters.ParameterError, match="no parameter bag='x'"):
-        parameters.check_names(make_node(bag='x'), 'sim')
-    parameters.check_names(make_node(bag='x', use_sim_time=True), 'record')
+        given.check_names(make_node(bag='x'), 'sim', arguments)
+    given.check_names(make_node(bag='x', use_sim_time=True), 'record', arguments)
+
+
+FILE = """
+/**:
+  ros__parameters: {camera: {rate: 30}, bag: /tmp/bag, delay: 7, config: quick}
+/r/n:
+  ros__parameters: {sac: {tua: 0.1}}
+"/*/m":
+  ros__parameters: {other: 1}
+r:
+  n: {ros__parameters: {inner: 1}}
+"""
+
+
+def test_a_parameter_file_for_all_nodes_may_hold_what_others_need(make_node, tmp_path):
+    file = tmp_path / 'all.yaml'
+    file.write_text(FILE)
+    arguments = ['--ros-args', '--params-file', str(file)]
+    assert given.addressed(arguments, 'n') == {'sac.tua', 'inner'}
+    shared = {'camera__rate': 30, 'bag': '/tmp/bag', 'delay': 7, 'config': 'quick'}
+    for role in ('sim', 'learner', 'record'):
+        given.check_names(make_node(**shared), role, arguments)
+    with pytest.raises(
+        parameters.ParameterError, match=r'no parameter sac.tua=0.1 \(did you mean sac.tau\?\)'
+    ):
+        given.check_names(make_node(sac__tua=0.1, **shared), 'learner', arguments)
 
 
 def test_the_learner_makes_its_settings_from_config_and_parameters(make_node):

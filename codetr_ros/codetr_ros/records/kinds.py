@@ -59,8 +59,8 @@ class Presence:
     run_id: str
     role: str  # one of `roles.ROLES`
     node: str  # fully qualified node name; its last part names the sources where role is 'sim'
-    instance_id: str  # a new one at each start of the process
-    settings_hash: str  # empty while the node still waits for the run
+    instance_id: str  # a new one at each start of the process; names the process for its machine
+    settings_hash: str  # empty while the node still waits for the run, and once it has given up
     finished: bool
     topics: tuple[str, ...]
     published: U64  # (len(topics),)

@@ -16,8 +16,10 @@ from codetr_ros.ros import parameters
 from codetr_ros.ros.errors import NodeError
 from codetr_ros.ros.gathering import IDLE, wait_for
 from codetr_ros.ros.membership import Membership
+from codetr_ros.ros.signals import Stopped
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.simulation import tasks
+from codetr_ros.system.files import make_folder
 
 NAME_PATIENCE = 2.0  # [s] until the name of a node with known topics is known
 
@@ -147,12 +149,16 @@ def join(
     if announce is not None:
         link.advertise(['run'], settings)
         link.publish(run)
-    make_core = load_core()
+    try:
+        with member.stop.importing():
+            make_core = load_core()
+    except Stopped:
+        return None
     if 'torch' in sys.modules:  # the recorder has no torch and needs none
         sys.modules['torch'].set_num_threads(settings.threads)
     folder = member.folder
     if announce is not None and folder and not (folder / run_folder.CONFIG).exists():
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         run_folder.write_settings(folder, settings)
     checkpoints = folder / run_folder.CHECKPOINTS if folder else None
     own = {name: member.values[name] for name in parameters.core_parameters(member.role)}

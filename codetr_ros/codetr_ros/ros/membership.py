@@ -3,6 +3,7 @@
 import hashlib
 import secrets
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +20,15 @@ from codetr_ros.records import (
     describe,
 )
 from codetr_ros.records.roles import published_by
-from codetr_ros.ros import link, messages, parameters
+from codetr_ros.ros import given, link, messages, parameters
 from codetr_ros.ros.errors import NodeError
 from codetr_ros.ros.fetch import Fetcher
 from codetr_ros.ros.link import Link
 from codetr_ros.ros.peers import Peers
 from codetr_ros.ros.signals import Stop
 from codetr_ros.ros.traffic import Traffic
+from codetr_ros.system.files import FileError, check_makeable
+from codetr_ros.system.liveness import own_name
 
 PRESENCE_EVERY = 1.0  # [s] between two messages of presence and diagnostics
 
@@ -55,11 +58,13 @@ class Membership:
         role: one of `records.ROLES`.
         name: node name unless remapped.
         stop: true once the process is asked to stop.
+        arguments: the command line from which the node has its parameters.
     """
 
-    def __init__(self, role: str, name: str, stop: Stop) -> None:
+    def __init__(self, role: str, name: str, stop: Stop, arguments: Sequence[str] = ()) -> None:
         self.role = role
         self.stop = stop
+        self._arguments = arguments
         self.link = Link(name)
         self.log = self.link.node.get_logger()
         self.peers = Peers(role)
@@ -72,7 +77,7 @@ class Membership:
         self.doing = 'starting'
         self.deadline_is = 'parameter peer_deadline (of `codetr train`: --peer-deadline)'
         self.again = 'start the run again'
-        self._instance = secrets.token_hex(8)
+        self._instance = f'{secrets.token_hex(8)} {own_name()}'.rstrip()
         self._serves = False  # the core is made from the run's settings
         self._fetcher: Fetcher | None = None
         self._logged: set[str] = set()  # errors that are logged once
@@ -93,12 +98,31 @@ class Membership:
 
         Raises:
             ParameterError: one of them is unknown, of the wrong type or out of range.
+            NodeError: nothing can be written where one of them points to.
         """
-        parameters.check_names(self.link.node, self.role)
+        given.check_names(self.link.node, self.role, self._arguments)
         self.values = parameters.declare_own(self.link.node, self.role)
         self.link.advertise(['presence'])
         self.link.subscribe(Presence, self.take)
         self.link.subscribe(RunSpec, self.take)
+        self._check_folders()
+
+    def _check_folders(self) -> None:
+        """Refuse a folder in which nothing can be written, now rather than at the end of a phase.
+
+        Raises:
+            NodeError: names the parameter, its value, the reason and the remedy.
+        """
+        for name in ('folder', 'bag'):
+            if not (value := self.values.get(name)):
+                continue
+            try:
+                check_makeable(Path(value))
+            except FileError as error:
+                self.values[name] = ''  # there, the report of the node cannot be written either
+                raise NodeError(
+                    f'{self.link.full_name}: parameter {name} = {value!r}: {error}'
+                ) from None
 
     def serve(self, core: Core[Any]) -> None:
         """Hand records to a core from now on, and fetch again those that it lacks."""
@@ -202,6 +226,11 @@ class Membership:
         if text not in self._logged:
             self._logged.add(text)
             self.log.error(text)
+
+    def give_up(self) -> None:
+        """Let the other nodes know, by the presences to come, that this one has failed."""
+        for each in (self, *self.company):
+            each._serves = False  # noqa: SLF001 - members of the same process
 
     def publish_presence(self, finished: bool = False) -> None:
         """Publish the node's presence, and the counts of its messages on /diagnostics.

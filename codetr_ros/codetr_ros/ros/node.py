@@ -14,6 +14,8 @@ import gc
 import logging
 import os
 import resource
+import signal
+import sys
 import time
 import traceback
 from collections.abc import Callable, Iterable
@@ -103,6 +105,7 @@ class Node:
             for each in given or ():
                 wiring.deliver(each)
             self._sound = True
+            wiring.show(given or (), member.doing)
             if given is not None:
                 waiting = None
                 member.doing = 'works'
@@ -122,6 +125,10 @@ class Node:
         """Save, report, take leave; returns the exit code."""
         stop = self.member.stop
         finished = wiring is not None and wiring.joined.core.finished and error is None
+        if stop.signal and not finished:
+            error = error or self._deserted(stop.signal)
+        if error:
+            self.member.give_up()
         steps: list[Callable[[], None]] = [
             lambda: self._report(wiring, finished, error),
             self._take_leave,
@@ -136,6 +143,7 @@ class Node:
             except Exception as problem:  # noqa: BLE001 - one failure must not stop the rest
                 error = error or errors.in_words(problem)
                 self._log_fatal(problem, 'at the end: ')
+                self.member.give_up()
         if stop.signal and not error and not finished:
             self._log.info(f'stopped by {stop.signal.name}')
         code = 1 if error else 0
@@ -145,6 +153,21 @@ class Node:
             self._log.warning(f'nothing will end this process if its middleware hangs: {problem}')
         self.member.close()
         return code
+
+    def _deserted(self, number: signal.Signals) -> str | None:
+        """Why the run had failed before a signal ended this node; None if it had not. Else a run
+        whose simulator was killed would seem to have ended as its user wished.
+        """
+        member = self.member
+        if not member.begun:
+            return None
+        member.link.handle()  # the last presences
+        failed = member.peers.failed()
+        if not failed:
+            return None
+        error = f'stopped by {number.name} before the run was over: {"; ".join(failed)}'
+        self._log.error(f'{error}. Look at the log of that node')
+        return error
 
     def _report(self, wiring: Wiring | None, finished: bool, error: str | None) -> None:
         member = self.member
@@ -231,19 +254,31 @@ def run_node(
         wire: another wiring (the recorder's).
 
     Returns:
-        Exit code: 0, also after SIGINT or SIGTERM; 1 after an error.
+        Exit code: 0, also after SIGINT or SIGTERM unless other nodes had failed before; 1 after an
+        error; 2 for arguments that ROS cannot read.
     """
     stop = stop or Stop().install()
+    stop.started()
     for variable, value in middleware.DEFAULTS.items():
         os.environ.setdefault(variable, value)
-    arguments = None if argv is None else [name, *argv]
+    arguments = sys.argv if argv is None else [name, *argv]
     announce = joining.own_run if role == 'learner' else None
-    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    code: int | None = None
     try:
-        member = Membership(role, name, stop)
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:  # an argument, or a parameter file, that ROS cannot read
+        print(f'{name}: {error}', file=sys.stderr)
+        return 2
+    try:
+        member = Membership(role, name, stop, arguments)
         logging.getLogger('codetr_ros').addHandler(_ToRos(member.log))
-        return Node(member, lambda it: joining.join(it, load_core, announce), wire).run()
+        code = Node(member, lambda it: joining.join(it, load_core, announce), wire).run()
+        return code
     finally:
         rclpy.try_shutdown()
         signals.ignore()
         gc.freeze()  # or the interpreter's last collection goes through all of torch: 2 to 7 s
+        if stop.cut_short and code is not None:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(code)

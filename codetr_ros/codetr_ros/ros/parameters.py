@@ -223,28 +223,6 @@ def overrides(node: Node) -> dict[str, Any]:
     return {name: parameter.value for name, parameter in given.items()}
 
 
-def check_names(node: Node, role: str) -> None:
-    """Refuse parameters that do not exist.
-
-    Raises:
-        ParameterError: names all of them, and those that exist.
-    """
-    known = set(FIELDS) | set(own_parameters(role))
-    unknown = {
-        name: value
-        for name, value in overrides(node).items()
-        if name not in known
-        and not node.has_parameter(name)
-        and not name.startswith('qos_overrides.')
-    }
-    if unknown:
-        given = ', '.join(f'{name}={value!r}' for name, value in sorted(unknown.items()))
-        raise ParameterError(
-            f'{node.get_fully_qualified_name()} has no parameter {given}. There are: '
-            f'{", ".join(sorted(known))}'
-        )
-
-
 def declare_own(node: Node, role: str) -> dict[str, Any]:
     """Declare the node's own parameters and return their values.
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 from codetr_ros.config import Settings
 from codetr_ros.records import Presence, roles
+from codetr_ros.system.liveness import has_ended
 
 
 @dataclass
@@ -19,12 +20,23 @@ class Peer:
 
     presence: Presence
     received_at: float  # monotonic time [s] when the presence arrived
+    served: bool = False  # whether it has ever taken part in the run
 
     @property
     def published(self) -> dict[str, int]:
         """Counts of the records that it has published, by topic."""
         presence = self.presence
         return dict(zip(presence.topics, presence.published.tolist(), strict=True))
+
+    @property
+    def failed(self) -> bool:
+        """Whether it has ended before its run was over, and was not asked to: it has given up, or
+        its process is gone.
+        """
+        presence = self.presence
+        if presence.finished:
+            return self.served and not presence.settings_hash
+        return self.served and has_ended(presence.instance_id.partition(' ')[2])
 
 
 @dataclass
@@ -37,7 +49,8 @@ class Peers:
     def note(self, presence: Presence, now: float) -> str | None:
         """Note a peer's presence; returns what is new about it, for the log."""
         known = self.by_instance.get(presence.instance_id)
-        self.by_instance[presence.instance_id] = Peer(presence, now)
+        served = bool(presence.settings_hash) or (known is not None and known.served)
+        self.by_instance[presence.instance_id] = Peer(presence, now, served)
         who = f'{presence.role} {presence.node}'
         if known is None:
             before = [p for p in self.by_instance.values() if p.presence.node == presence.node]
@@ -88,6 +101,20 @@ class Peers:
         """Peers that publish on one of these topics."""
         writers = {role for topic in topics for role in roles.WRITERS.get(topic, ())}
         return [peer for role in sorted(writers) for peer in self.alive(role)]
+
+    def failed(self) -> list[str]:
+        """Roles and names of the nodes that have died or else, since a node that dies makes others
+        give up, of those that have given up, in words.
+        """
+        died, given_up = [], []
+        for peer in self.newest():
+            if peer.failed:
+                who = f'{peer.presence.role} {peer.presence.node} has'
+                if peer.presence.finished:
+                    given_up.append(f'{who} given up')
+                else:
+                    died.append(f'{who} died')
+        return died or given_up
 
     def anybody_left(self) -> bool:
         """Whether any peer has not finished."""

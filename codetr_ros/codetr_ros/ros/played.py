@@ -1,6 +1,6 @@
 """The played roles of a recorded run: live nodes wait for them."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any
 
 from rclpy.logging import LoggingSeverity
@@ -49,6 +49,9 @@ class PlayedWiring(Wiring):
 
     def _pass(self, kind: type, raw: bytes) -> None:
         self.member.traffic.received[TOPICS[kind]] += 1
+
+    def show(self, given: Sequence[Any], doing: str) -> None:
+        """Log nothing: the player logs what it has played."""
 
     def lacking(self) -> list[str]:
         """The live peers that are absent or not matched yet, in words."""

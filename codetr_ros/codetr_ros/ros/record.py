@@ -18,7 +18,7 @@ def load() -> 'MakeCore':
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; the imports follow the signal handlers, since they take a while."""
-    stop = Stop().install()
+    stop = Stop().install(starting=True)
     try:
         from codetr_ros.ros.node import run_node
         from codetr_ros.ros.recording import Recording

@@ -22,8 +22,10 @@ from codetr_ros.records.checks import check_run
 from codetr_ros.records.fields import type_name
 from codetr_ros.records.roles import published_by
 from codetr_ros.ros import messages, qos
+from codetr_ros.ros.errors import NodeError
 from codetr_ros.ros.joining import Joined
 from codetr_ros.ros.membership import Membership
+from codetr_ros.ros.patience import GRACE
 from codetr_ros.ros.resend import Resender
 from codetr_ros.ros.wiring import Wiring
 from codetr_ros.runs import folder as run_folder
@@ -145,12 +147,24 @@ class Recording(Wiring):
         }
 
     def settled(self, seconds: float) -> bool:
-        """Whether all nodes have finished and all their records are in the bag."""
+        """Whether all nodes have finished and all their records are in the bag.
+
+        Raises:
+            NodeError: a node has ended too early, or records never arrived.
+        """
         peers, deadline = self.member.peers, self.member.deadline
-        newest = [peer.presence for peer in peers.newest()]
-        running = [f'{p.role} {p.node}' for p in newest if not p.finished]
+        now = time.monotonic()
+        newest = [p for p in peers.newest() if not (p.failed and now - p.received_at > GRACE)]
+        present = [p.presence for p in newest if not p.presence.finished]
+        running = [f'{p.role} {p.node}' for p in present]
         missing = self.member.traffic.lost_for_good = self._still_missing()
         if not running and not missing:
+            if failed := peers.failed():
+                raise NodeError(
+                    f'{self.member.link.full_name}: every phase is recorded, but '
+                    f'{"; ".join(failed)}, and the bag lacks what was still to come from there. '
+                    'Look at the log of that node'
+                )
             return True
         lacking = [f'{n} of {topic}' for topic, n in missing.items()]
         self.member.doing = (
@@ -159,10 +173,12 @@ class Recording(Wiring):
         )
         # a node that still publishes its presence may work as long as it needs
         newest_at = max((p.received_at for p in peers.by_instance.values()), default=0.0)
-        silent = time.monotonic() - newest_at
+        silent = now - newest_at
         if deadline and min(seconds, silent) > deadline:
-            self.log.error(f'gave up after {deadline:g} s: {self.member.doing}')
-            return True
+            raise NodeError(
+                f'{self.member.link.full_name} gave up after {deadline:g} s: {self.member.doing}. '
+                'The bag lacks that'
+            )
         return False
 
     def close(self) -> None:

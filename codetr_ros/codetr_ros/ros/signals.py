@@ -4,10 +4,17 @@ rclpy's own handlers shut the context down from a thread. That races with everyt
 publishes (a double `shutdown`, publishing on an invalid context, a KeyboardInterrupt in the middle
 of a record). Here a signal sets a flag, and the main loop checks it. A second signal changes
 nothing.
+
+Imports take seconds, in which nothing checks a flag, and `ros2 launch` kills a process that has
+not ended ten seconds after its first signal. So a signal ends the process at once while it still
+imports what makes it a node, and later cuts an import short by an exception.
 """
 
 import faulthandler
+import os
 import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 
 from codetr_ros.ros import exit_timer
@@ -15,12 +22,25 @@ from codetr_ros.ros import exit_timer
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
+class Stopped(BaseException):
+    """A signal has cut an import short. No error, so that nothing which is imported catches it."""
+
+
 class Stop:
-    """True once a signal has asked the process to stop."""
+    """True once a signal has asked the process to stop.
+
+    Attributes:
+        signal: the first signal; None before.
+        cut_short: whether an import was cut short: what was imported may be in halves, and the
+            process must end without the interpreter's own end.
+    """
 
     def __init__(self) -> None:
         self.signal: signal.Signals | None = None
+        self.cut_short = False
         self._installed = False
+        self._starting = False
+        self._importing = False
 
     def __bool__(self) -> bool:
         return self.signal is not None
@@ -28,13 +48,47 @@ class Stop:
     def _note(self, number: int, _frame: FrameType | None) -> None:
         if self.signal is None:
             self.signal = signal.Signals(number)
+        if self._starting:
+            name = signal.Signals(number).name
+            os.write(2, f'stopped by {name} before it had started\n'.encode())
+            os._exit(0)
+        if self._importing:
+            self.cut_short = True
+            raise Stopped
 
-    def install(self) -> 'Stop':
-        """Handle the two signals from now on. Call it first, before any slow import."""
+    def install(self, starting: bool = False) -> 'Stop':
+        """Handle the two signals from now on. Call it first, before any slow import.
+
+        Args:
+            starting: until `started` is called, a signal ends the process at once, with exit code
+                0: nobody knows of it yet, and nothing is lost.
+        """
         for number in SIGNALS:
             signal.signal(number, self._note)
         self._installed = True
+        self._starting = starting
         return self
+
+    def started(self) -> None:
+        """From now on a signal sets the flag, and the process ends in order."""
+        self._starting = False
+
+    @contextmanager
+    def importing(self) -> Iterator[None]:
+        """Let a signal cut short what runs inside.
+
+        Raises:
+            Stopped: it did, or had come before.
+        """
+        self._importing = True
+        try:
+            if self:
+                raise Stopped
+            yield
+        finally:
+            self._importing = False
+        if self:  # what was imported has caught it
+            raise Stopped
 
     def end_within(self, seconds: int, code: int) -> None:
         """End this process with an exit code if it still runs after that many seconds.

@@ -1,9 +1,10 @@
 """Wires the core of a node to the topics of its run."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from codetr_ros.records.roles import published_by
+from codetr_ros.ros.course import Course
 from codetr_ros.ros.gathering import absent_or_unmatched
 from codetr_ros.ros.joining import Joined
 from codetr_ros.ros.membership import Membership
@@ -22,6 +23,7 @@ class Wiring:
         self.member = member
         self.joined = joined
         self.log = member.log
+        self._course = Course(joined.settings, member.log)
 
     def enter(self) -> None:
         """Open the topics, and publish that the node has joined."""
@@ -52,6 +54,17 @@ class Wiring:
     def deliver(self, given: Any) -> None:
         """Publish what the core yielded: a record."""
         self.member.link.publish(given)
+
+    def show(self, given: Sequence[Any], doing: str) -> None:
+        """Log how far the node has come, if it is time for a line.
+
+        Args:
+            given: what the core has yielded.
+            doing: what the node does, in words.
+        """
+        for each in given:
+            self._course.note(each)
+        self._course.tick(doing)
 
     def waits(self) -> str:
         """What the node waits for, in words."""

@@ -22,7 +22,7 @@ import safetensors
 import safetensors.torch
 import torch
 
-from codetr_ros.system.files import sync_folder, write_synced
+from codetr_ros.system.files import make_folder, sync_folder, write_synced
 
 TENSORS = 'tensors.safetensors'
 DESCRIPTION = 'checkpoint.json'
@@ -106,11 +106,11 @@ def save(
             f'checkpoint {name}, phase {phase}: meta cannot be written as JSON: {error}'
         ) from None
 
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     _remove_partial(folder, name)
     path = folder / f'{name}-{phase:06d}'
     partial = folder / f'.{name}-{phase:06d}.partial'
-    partial.mkdir()
+    make_folder(partial)
     write_synced(partial / TENSORS, data)
     write_synced(partial / DESCRIPTION, description)
     sync_folder(partial)

@@ -7,7 +7,7 @@ from pathlib import Path
 import yaml
 
 from codetr_ros import config
-from codetr_ros.system.files import FileError, atomic_write, check_writable
+from codetr_ros.system.files import FileError, atomic_write, check_makeable, check_writable
 
 CONFIG = 'config.yaml'
 BAG = 'bag'
@@ -46,11 +46,8 @@ def check(path: Path) -> None:
                 '--out, or remove it'
             )
         return
-    parent = path.absolute().parent
-    while not parent.exists():
-        parent = parent.parent
     try:
-        check_writable(parent)
+        check_makeable(path)
     except FileError as error:
         raise RunFolderError(f'output folder {path} cannot be made, {error} with --out') from None
 

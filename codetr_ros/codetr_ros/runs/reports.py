@@ -15,7 +15,7 @@ from pydantic import Field, JsonValue
 from codetr_ros.runs import facts
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.facts import Counts, Facts
-from codetr_ros.system.files import atomic_write
+from codetr_ros.system.files import atomic_write, make_folder
 
 
 class MemoryFacts(Facts):
@@ -171,7 +171,7 @@ def _known(facts: Facts) -> dict[str, JsonValue]:
 
 def write(path: Path, report: NodeReport) -> None:
     """Write a node's report; `folder.report_path` gives the path."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     atomic_write(path, json.dumps(_known(report), indent=2) + '\n')
 
 

@@ -53,6 +53,30 @@ def check_writable(folder: Path) -> None:
         raise FileError(error.errno, error.strerror, str(folder)) from error
 
 
+def check_makeable(folder: Path) -> None:
+    """Check that files can be written in a folder, or that it can be made; leaves nothing behind.
+
+    Raises:
+        FileError: the folder, or the nearest above it that exists, cannot be written.
+    """
+    there = folder.absolute()
+    while not there.exists():
+        there = there.parent
+    check_writable(there)
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder, with all above it, where there is none.
+
+    Raises:
+        FileError: it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(error.errno, error.strerror, str(folder)) from error
+
+
 def sync_folder(folder: Path) -> None:
     """Make renames and new names in a folder survive a power loss."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
