@@ -16,6 +16,7 @@ import yaml
 from codetr_ros import cli, config
 from codetr_ros.cli import film
 from codetr_ros.cores import in_process
+from codetr_ros.records import EpisodeResult, Record
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.simulation import tasks
 
@@ -26,7 +27,8 @@ SETTINGS = config.load('quick').changed(
         'steps': 200,
         'phase_steps': 100,
         'warmup_steps': 100,
-        'evaluate_every': 0,
+        'evaluate_every': 100,
+        'evaluate_episodes': 1,
         'sac.hidden': (8,),
         'sac.batch': 8,
     }
@@ -43,12 +45,14 @@ def child(text: str) -> tuple[str, ...]:
 
 
 @pytest.fixture(scope='module')
-def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a tiny run."""
+def a_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[EpisodeResult]]:
+    """The folder of a tiny run, and the results of its evaluations."""
     folder = run_folder.create(tmp_path_factory.mktemp('runs') / 'tiny')
     run_folder.write_settings(folder, SETTINGS)
-    in_process.run(SETTINGS, 'run', folder)
-    return folder
+    records: list[Record] = []
+    in_process.run(SETTINGS, 'run', folder, records.append)
+    results = [r for r in records if isinstance(r, EpisodeResult) and r.purpose != 'training']
+    return folder, results
 
 
 @pytest.fixture(scope='module')
@@ -64,11 +68,17 @@ def driver() -> str:
 
 
 @pytest.mark.slow
-def test_a_film_shows_both_policies_and_how_long_it_took(run_dir: Path, driver: str) -> None:
+def test_a_film_shows_the_episodes_of_the_runs_own_evaluations(
+    a_run: tuple[Path, list[EpisodeResult]], driver: str
+) -> None:
+    run_dir, results = a_run
+    random, last = results[0], results[-1]
+    assert (random.purpose, last.step) == ('random', 200)
+
     note = film.make(run_dir, environment={**os.environ, 'MUJOCO_GL': driver})
 
-    assert 'random policy' in note
-    assert 'after 200 steps' in note
+    lengths = f'random policy {random.length} steps, after 200 steps {last.length} steps'
+    assert f'It lasted: {lengths}. Drawing it took ' in note
     assert note.endswith(' s.'), note
     image = matplotlib.image.imread(io.BytesIO((run_dir / 'film.png').read_bytes()))
     height, width, _ = image.shape

@@ -7,11 +7,13 @@ from typing import Any
 import pytest
 
 from codetr_ros import cli
+from codetr_ros.cli import report
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import reports, run_summary
 from codetr_ros.runs.reports import NodeReport
 from codetr_ros.runs.summary import Summary
 from helpers.bags import ours
+from helpers.benchmark_folders import benchmark
 from helpers.builders import run
 from helpers.summaries import REPORTED, SETTINGS, Clock, a_run
 
@@ -24,8 +26,8 @@ def folder(tmp_path: Path) -> Path:
     ours(tmp_path / run_folder.BAG, [run(SETTINGS, 'r'), *a_run()])
     run_folder.write_settings(tmp_path, SETTINGS)
     for made in REPORTED.values():
-        report = NodeReport.model_validate({'name': made['role'], **made, 'bag': None})
-        reports.write(run_folder.report_path(tmp_path, report.role, report.name), report)
+        node = NodeReport.model_validate({'name': made['role'], **made, 'bag': None})
+        reports.write(run_folder.report_path(tmp_path, node.role, node.name), node)
     return tmp_path
 
 
@@ -137,3 +139,13 @@ def test_a_folder_without_a_run_is_refused(what, said, tmp_path, capsys):
 
     assert said in capsys.readouterr().err
     assert not (tmp_path / what / run_folder.SUMMARY).exists()
+
+
+def test_the_folder_of_a_benchmark_gets_the_report_of_a_benchmark(tmp_path, capsys):
+    made = benchmark(tmp_path / 'b', lambda cell: 0.25, methods=['none'])
+    assert made.path.joinpath(report.BENCHMARK).is_file()
+
+    assert cli.main(['report', str(made.path)]) == 0
+
+    assert '0.2500 (0.0000)*' in capsys.readouterr().out
+    assert (made.path / 'report' / 'index.html').is_file()

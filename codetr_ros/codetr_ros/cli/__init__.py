@@ -18,7 +18,7 @@ commands:
   fit        fit a reward model to bags, without any node
   label      write a bag with a reward model's step rewards added
   convert    make a bag for `fit` from ordinary topics, by a mapping file
-  report     make the summary, report and pictures of a run, however it was started
+  report     make the report of a run, however it was started, or of a benchmark
   evaluate   evaluate the policy of a run's newest checkpoint
   benchmark  do many runs under one protocol, and make a table of them
   bag        show, check, recover or play a bag

@@ -158,21 +158,18 @@ def draw(folder: Path, settings: 'Settings', policy: Any) -> str:
     start = int(generator(settings.seed, 'evaluate', 0).integers(2**31))
     runner = EpisodeRunner(environment, settings, 'evaluate')
 
-    def reset() -> None:
+    def begin() -> None:
         seed_global(settings.seed, 'environment', 'evaluate', 0)
         runner.reset(start, 0)
 
-    steps = settings.steps_after(policy.version)
-    rows = {}
+    acts: dict[str, Act] = {
+        'random policy': lambda episode: actions[episode.length],
+        f'after {settings.steps_after(policy.version)} steps': lambda episode: acting.act(
+            episode.observation, step=episode.place
+        ),
+    }
     with Drawing(environment, WIDTH, HEIGHT) as drawing:
-        for name, act in (
-            ('random policy', lambda episode: actions[episode.length]),
-            (
-                f'after {steps} steps',
-                lambda episode: acting.act(episode.observation, step=episode.length),
-            ),
-        ):
-            rows[name] = _frames(runner, reset, act, drawing.frame)
+        rows = {name: _moments(runner, begin, act, drawing.frame) for name, act in acts.items()}
     atomic_write(folder / run_folder.FILM, strip(rows))
     lengths = ', '.join(f'{name} {moments[-1][0]} steps' for name, moments in rows.items())
     return (
@@ -184,25 +181,25 @@ def draw(folder: Path, settings: 'Settings', policy: Any) -> str:
 Moments = list[tuple[int, 'Frame']]
 
 
-def _frames(
-    runner: 'EpisodeRunner', reset: Callable[[], None], act: Act, frame: Callable[[], 'Frame']
+def _moments(
+    runner: 'EpisodeRunner', begin: Callable[[], None], act: Act, frame: Callable[[], 'Frame']
 ) -> Moments:
     """Frames of an episode with their steps: the first, the last, and those between, evenly.
 
     The episode is run twice, because its length is not known before.
     """
-    reset()
+    begin()
     while not runner.over:
         runner.step(act(runner))
     last = runner.length
     due = [round(i * last / (FRAMES - 1)) for i in range(FRAMES)]
-    reset()
-    frames: Moments = []
+    begin()
+    moments: Moments = []
     for step in due:
         while runner.length < step and not runner.over:  # over: it draws from what has no seed
             runner.step(act(runner))
-        frames.append((step, frame().copy()))
-    return frames
+        moments.append((step, frame().copy()))
+    return moments
 
 
 def strip(rows: Mapping[str, Moments]) -> bytes:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from codetr_ros.cli import FAILED, refuse, results
+from codetr_ros.cli import FAILED, benchmark, refuse, results
 from codetr_ros.cli import film as film_strip
 from codetr_ros.cli.terminal import console, parse_arguments
 from codetr_ros.config import Settings, SettingsError, from_canonical
@@ -21,6 +21,9 @@ from codetr_ros.runs.reports import NodeReport
 from codetr_ros.runs.run_summary import RunSummary
 from codetr_ros.runs.summary import Summary
 
+BENCHMARK = 'benchmark.json'
+"""Lies in the folder of a benchmark: `benchmark.folder.INDEX`, which is slow to import."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
@@ -29,6 +32,7 @@ class Arguments:
     For a run whose nodes were started by hand or by a launch file, for one that was killed, and
     for one that still runs. Everything is taken from the bag, the nodes' reports and the settings
     in the folder. What `codetr train` alone can know is taken from its summary, if there is one.
+    The folder of a benchmark gets the report of `codetr benchmark report`.
     """
 
     run_dir: Annotated[
@@ -56,6 +60,8 @@ def main(arguments: Sequence[str]) -> int:
     """Make and print it; returns the exit code."""
     given = parse_arguments(Arguments, arguments, 'codetr report')
     folder = given.run_dir.absolute()
+    if (folder / BENCHMARK).is_file():
+        return benchmark.main(['report', str(given.run_dir)])
     shown = console()
 
     def log(text: str) -> None:
