@@ -152,6 +152,14 @@ def test_a_task_that_only_this_process_knows_is_refused_over_topics(
     assert list(Path.cwd().iterdir()) == []
 
 
+@pytest.mark.skipif(torch.cuda.is_available(), reason='needs a machine without a GPU')
+def test_a_gpu_that_a_method_has_no_use_for_is_not_asked_for() -> None:
+    changes = {'reward_device': 'cuda', 'method': 'uniform'}
+    tryout.here(load('quick').changed(changes))
+    with pytest.raises(TryoutError, match='reward_device=cuda: torch'):
+        tryout.here(load('quick').changed(changes | {'method': 'rrd'}))
+
+
 @pytest.mark.usefixtures('built')
 @WAYS
 def test_a_compiler_that_is_not_there_is_refused_before_a_folder_is_made(

@@ -7,6 +7,7 @@ import sys
 from dataclasses import replace
 
 import pytest
+import torch
 from rosbags.rosbag2 import StoragePlugin
 
 from codetr_ros import cli, config
@@ -201,3 +202,14 @@ def test_settings_of_another_version_do_not_make_the_data_worthless(a_run, tmp_p
 
     assert 'warp = 9: there is no such setting' in said['notes'][0]
     assert said['delay'] == 7
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason='there is a GPU here')
+@pytest.mark.parametrize('schedule', ['epochs', 'phases'])
+def test_a_device_that_is_not_here_is_refused_before_a_folder_is_made(
+    a_run, tmp_path, capsys, schedule
+):
+    out = tmp_path / 'out'
+    fit(a_run.bag, out, f'--schedule={schedule}', '--reward-device=cuda', code=1)
+    assert 'reward_device=cuda: torch' in capsys.readouterr().err
+    assert not out.exists()

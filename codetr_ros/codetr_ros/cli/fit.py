@@ -213,7 +213,7 @@ def _index(given: Arguments) -> 'tuple[Index, Console]':
 
 
 def _refuse_unfit(settings: Settings) -> None:
-    from codetr_ros.rewards.registry import METHODS
+    from codetr_ros.rewards.registry import METHODS, check_device
 
     fit = [name for name in METHODS if name not in config.IN_PROCESS_ONLY]
     if settings.method not in fit:
@@ -221,6 +221,7 @@ def _refuse_unfit(settings: Settings) -> None:
             settings.method, 'has no reward model: its policy learner learns from the scores'
         )
         raise FitError(f'--method {settings.method} {why}. Choose one of --method {"|".join(fit)}')
+    check_device(settings)
 
 
 def _phases(arguments: Sequence[str], given: Arguments) -> int:

@@ -65,14 +65,15 @@ def _compiler(settings: Settings) -> None:
 
 
 def _devices(settings: Settings) -> None:
-    wanted = {field: getattr(settings, field) for field in ('device', 'reward_device')}
-    if set(wanted.values()) == {'cpu'}:
+    if settings.device == settings.reward_device == 'cpu':
         return  # torch takes seconds to import
+    from codetr_ros.rewards import registry
     from codetr_ros.system.devices import DeviceError, usable
 
     try:
-        for field, device in wanted.items():
-            usable(device, field)
+        usable(settings.device)
+        if settings.labels_steps:
+            registry.check_device(settings)
     except DeviceError as error:
         raise TryoutError(str(error)) from error
 

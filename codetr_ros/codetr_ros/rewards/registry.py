@@ -6,6 +6,7 @@ from codetr_ros.rewards.codetr import Codetr
 from codetr_ros.rewards.diaster import Diaster
 from codetr_ros.rewards.evidence.method import Evidence
 from codetr_ros.rewards.ircr import Ircr
+from codetr_ros.rewards.learned import Learned
 from codetr_ros.rewards.lrr import Lrr
 from codetr_ros.rewards.mil_lstm import MilLstm
 from codetr_ros.rewards.mlp import Mlp
@@ -13,6 +14,7 @@ from codetr_ros.rewards.rbt import Rbt
 from codetr_ros.rewards.redistribution import LastStep, Ones, Random, TrueReward, Uniform
 from codetr_ros.rewards.residual import CodetrOnEvidence
 from codetr_ros.rewards.rrd import Rrd
+from codetr_ros.system.devices import usable
 
 METHODS: dict[str, type[RewardMethod]] = {
     method.name: method
@@ -50,6 +52,17 @@ def kind(settings: Settings) -> type[RewardMethod]:
     if settings.method == Codetr.name and settings.codetr.base == 'evidence':
         return CodetrOnEvidence
     return METHODS[settings.method]
+
+
+def check_device(settings: Settings) -> None:
+    """Refuse a reward device that is not there, unless the method has no use for it.
+
+    Raises:
+        RewardModelError: there is no such method.
+        DeviceError: the device is not there.
+    """
+    if issubclass(kind(settings), Learned):
+        usable(settings.reward_device, 'reward_device')
 
 
 def make(settings: Settings, observation_size: int, action_size: int) -> RewardMethod:
