@@ -147,6 +147,33 @@ def test_labels_of_several_ages_are_the_same_over_topics_and_in_process(tmp_path
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize('method', ['evidence', 'hc'])
+def test_irregular_missing_and_noisy_scores_are_the_same_over_topics_and_in_process(
+    tmp_path, method
+):
+    settings = tiny(
+        task=PENDULUM,
+        method=method,
+        delay='3:11',
+        score_missing=0.3,
+        score_noise=0.5,
+        score_levels=5,
+        simulators=2,
+        hc__width=8,
+    )
+    topics, _ = train(settings, tmp_path / 'topics')
+    calls = by_calls(settings)
+    check_same(topics, calls)
+    assert topics['lost'] == topics['duplicated'] == topics['refused'] == 0
+    for name in settings.simulator_names:
+        counters = topics['counters'][f'sim-{name}']
+        assert 0 < counters['scores missing'] < counters['scores'] / 2
+        assert counters == calls['counters'][name]
+    bag = verify(Path(topics['bag']))
+    assert bag.sound, bag.findings
+
+
+@pytest.mark.slow
 def test_two_simulators_over_topics_equal_two_in_process(tmp_path):
     settings = tiny(simulators=2, task=REACHER)
     topics, _ = train(settings, tmp_path / 'topics')

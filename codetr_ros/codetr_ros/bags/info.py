@@ -20,7 +20,10 @@ from codetr_ros.records import (
 )
 from codetr_ros.system.parsing import ParseError, parse_json
 
-SETTINGS = ('task', 'composite', 'delay', 'method', 'steps', 'seed', 'simulators', 'envs')
+SETTINGS = (
+    *('task', 'composite', 'delay', 'score_missing', 'score_noise', 'score_levels', 'method'),
+    *('steps', 'seed', 'simulators', 'envs'),
+)
 """The settings that are shown."""
 _SMALL = 2.0**-64  # a sum of numbers so much smaller cannot overflow, and is as exact
 
@@ -80,6 +83,7 @@ class RunCounts:
     phases: Range = field(default_factory=Range)
     scores: Range = field(default_factory=Range)
     scored_steps: int = 0
+    unscored: int = 0  # segments without a score
     policy_versions: Range = field(default_factory=Range)
     model_versions: Range = field(default_factory=Range)
     labels: int = 0
@@ -97,8 +101,11 @@ class RunCounts:
         elif isinstance(record, Transitions):
             self._steps(record)
         elif isinstance(record, CompositeReward):
-            self.scores.add(record.value)
-            self.scored_steps += record.length
+            if math.isnan(record.value) and self.settings.get('score_missing'):
+                self.unscored += 1
+            else:
+                self.scores.add(record.value)
+                self.scored_steps += record.length
         elif isinstance(record, Commit):
             self.phases.add(record.phase)
         elif isinstance(record, Policy):
@@ -139,6 +146,7 @@ class RunCounts:
             'phases': self.phases.report(),
             'segments_scored': self.scores.count + self.scores.not_finite,
             'steps_scored': self.scored_steps,
+            'segments_unscored': self.unscored,
             'scores': self.scores.report(),
             'policy_versions': self.policy_versions.report(),
             'model_versions': self.model_versions.report(),

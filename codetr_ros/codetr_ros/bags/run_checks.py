@@ -52,6 +52,7 @@ class RunChecks:
         self._findings = findings
         self._run: RunSpec | None = None
         self._cuts: Cuts | None = None
+        self._missing = False  # whether segments may have no score
         self._permitted = 0
         self._parts: tuple[int, int, int] | None = None  # phase, next part, parts
         self._take: dict[type, Callable[[Any, Any], None]] = {
@@ -110,9 +111,10 @@ class RunChecks:
                 'run', place, f'protocol {record.protocol_version}, this is {PROTOCOL_VERSION}'
             )
         try:
-            delay = parse_json(record.settings)['delay']
-            Lengths.of(delay)  # refuses what is no delay
-            self._cuts = Cuts(delay, record.seed)
+            settings = parse_json(record.settings)
+            Lengths.of(settings['delay'])  # refuses what is no delay
+            self._cuts = Cuts(settings['delay'], record.seed)
+            self._missing = settings.get('score_missing', 0) > 0
         except (ValueError, LookupError, TypeError) as error:
             self._add('run', place, f'settings cannot be read: {error}')
         for source in self.sources.values():
@@ -131,7 +133,7 @@ class RunChecks:
             self._scorers[record.scorer] = numbers
         if not numbers.take(record.sequence, place):
             return
-        if not np.isfinite(record.value):
+        if not np.isfinite(record.value) and not (self._missing and np.isnan(record.value)):
             self._add('value', place, f'{describe(record)} is not finite')
         if record.length < 1:
             self._add('value', place, f'{describe(record)} has no steps')

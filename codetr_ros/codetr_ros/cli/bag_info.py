@@ -102,7 +102,9 @@ def _run(run: Mapping[str, Any]) -> Table:
             f'chunks, {source["episodes"]} episodes ({source["terminated"]} terminated, '
             f'{source["truncated"]} truncated)',
         )
-    table.add_row('segments scored', f'{run["segments_scored"]}, {run["steps_scored"]} steps')
+    scored = f'{run["segments_scored"]}, {run["steps_scored"]} steps'
+    unscored = run['segments_unscored']
+    table.add_row('segments scored', scored + (f'; {unscored} without a score' * bool(unscored)))
     table.add_row('scores', _span(run['scores']))
     table.add_row('phases committed', _whole_span(run['phases']))
     table.add_row('policy versions', _whole_span(run['policy_versions']))

@@ -208,6 +208,7 @@ def _index(given: Arguments) -> 'tuple[Index, Console]':
     shown.print(
         f'{len(index.bags)} {"bag" if len(index.bags) == 1 else "bags"}: {index.steps} steps, '
         f'{index.scores} scores, {len(index.episodes)} episodes'
+        + (f', {index.unscored} segments without a score' * bool(index.unscored))
     )
     return index, shown
 

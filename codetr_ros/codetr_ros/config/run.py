@@ -99,6 +99,27 @@ class Settings(Schedule, Delayed, Group):
         description='steps n of a segment; each segment has one composite reward. 10:50 draws the '
         'length of each from 10 to 50 steps; episode: a segment is a whole episode',
     )
+    score_missing: float = Field(
+        0.0,
+        ge=0,
+        lt=1,
+        description='share of segments that get no score, drawn by the seed: their steps are '
+        'labelled by what is learnt from the others',
+    )
+    score_noise: float = Field(
+        0.0,
+        ge=0,
+        le=1000,
+        description="noise of scores, in standard deviations of the random policy's scores; "
+        'evaluations have the true ones',
+    )
+    score_levels: int = Field(
+        0,
+        ge=0,
+        le=1000,
+        description='levels of an ordinal scale on which segments are scored, 1 (worst) to so '
+        "many, as many of the random policy's scores on each; 0: scores are numbers",
+    )
     method: Method = Field(
         'codetr', description='how step rewards are made from composite rewards'
     )
@@ -209,6 +230,15 @@ class Settings(Schedule, Delayed, Group):
     lirpg: LirpgSettings = Field(
         default_factory=LirpgSettings, description='the policy learner of method lirpg'
     )
+
+    @model_validator(mode='after')
+    def _a_scale_has_two_levels(self) -> 'Settings':
+        if self.score_levels == 1:
+            raise ValueError(
+                'score_levels=1: a scale of one level says nothing of a segment; set 2 or more, '
+                'or 0 for scores that are numbers'
+            )
+        return self
 
     @model_validator(mode='after')
     def _on_policy_in_lock_step(self) -> 'Settings':

@@ -70,7 +70,7 @@ class Intake:
                 key = (record.source, record.sequence)
                 self._hold(record, self._transitions, key, self._taken['transitions'])
         elif isinstance(record, CompositeReward):
-            check_score(record, self._settings.scored_at_most)
+            check_score(record, self._settings.scored_at_most, self._settings.score_missing > 0)
             self._hold(
                 record, self._rewards, (record.scorer, record.sequence), self._taken['scores']
             )

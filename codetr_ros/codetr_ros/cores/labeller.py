@@ -150,6 +150,9 @@ class Labeller(Consumer):
         labelled, by which version, and which the learner will draw.
         """
         segments = due.segments_due(memory, method.version, self._settings)
+        if len(segments) and not len(memory.segments.ids()):  # nothing is known yet
+            self._counters['segments not labelled, nothing scored'] += len(segments)
+            return
         yield from self._whole(phase, memory, method, segments)
         if self._settings.relabel == 'all':
             return

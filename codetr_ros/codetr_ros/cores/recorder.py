@@ -82,7 +82,7 @@ class Recorder(Part):
                 if record.phase_end:
                     self._ended[record.phase, record.source] = (record.sequence, record.scores_due)
         elif isinstance(record, CompositeReward):
-            check_score(record, self._settings.scored_at_most)
+            check_score(record, self._settings.scored_at_most, self._settings.score_missing > 0)
             self._next(record, self._scores, record.scorer)
 
     def _next(self, record: Any, due: 'Counter[str]', name: str) -> bool:

@@ -20,6 +20,7 @@ from codetr_ros.records import (
 from codetr_ros.records.roles import subscribed
 from codetr_ros.runs.reports import CoreReport
 from codetr_ros.simulation.permission import acting_policy, check_policy
+from codetr_ros.simulation.scorer import ScoreScale
 from codetr_ros.simulation.source import Source
 
 
@@ -51,7 +52,10 @@ class Simulator(Part):
         self._run = run
         self._settings = settings
         self._name = name
-        self._sources = [Source(run, settings, each) for each in settings.sources_of(name)]
+        self._scale = ScoreScale.of(settings)
+        self._sources = [
+            Source(run, settings, each, self._scale) for each in settings.sources_of(name)
+        ]
         self._waiting: dict[int, tuple[Policy, ActingPolicy | None]] = {}
         self._phase = 0  # the next to be run
         self._counters: Counter[str] = Counter()
@@ -126,7 +130,7 @@ class Simulator(Part):
 
     def _metrics(self, phase: int, seconds: float) -> Metrics:
         step = self._settings.steps_after(phase)
-        values = {'simulate_seconds': seconds}
+        values = {'simulate_seconds': seconds} | self._scale.metrics()
         return metrics(self._run.run_id, 'sim', self._name, phase, step, values)
 
     def close(self) -> None:

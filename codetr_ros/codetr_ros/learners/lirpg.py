@@ -39,6 +39,7 @@ paper used that code, with its delay of rewards set to n. The differences, all o
 - The value loss is a plain squared error (half of it, times `value_coefficient`); theirs is
   clipped. There is no bonus for entropy (their coefficient is 0). Adam's step size and the place
   of its epsilon are torch's.
+- A segment without a score has the mean of all known ones in its place (decided here).
 
 Shapes: T = steps of the phase, B = steps of a minibatch, O, A = sizes of observation and action.
 
@@ -153,6 +154,10 @@ class Lirpg:
             return
         began = time.perf_counter()
         rollout = memory.store.newest(settings.shares_of(phase))
+        missing = np.isnan(rollout.rewards)  # of segments without a score
+        if missing.any():
+            known = memory.segments.scores(memory.segments.ids())
+            rollout.rewards[missing] = known.mean() if len(known) else 0.0
         self.counters['steps evicted before they were learnt from'] += settings.steps_of(
             phase
         ) - len(rollout.rewards)

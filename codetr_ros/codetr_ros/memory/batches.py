@@ -27,7 +27,7 @@ class SegmentBatch:
     actions: F32  # (B, L, A)
     lengths: I64  # (B,) steps in the window, context included
     context: I64  # (B,) leading steps that precede the segment
-    values: F64  # (B,) the segment's composite reward; NaN for windows that only serve labelling
+    values: F64  # (B,) the segment's composite reward; NaN: none, or only a window to be labelled
     true_rewards: F32 | None = None  # (B, L) if the memory holds them, for the oracle only
 
     def part(self, rows: slice) -> 'SegmentBatch':

@@ -18,7 +18,7 @@ def segments_due(memory: Trajectories, version: int, settings: Settings) -> I64:
     version are due too: all of them if `relabel_steps` is 0, else whole ones of at most so many
     steps together, and one at least. The oldest labels come first, among equals the lowest ids.
     """
-    ids = memory.segments.ids()
+    ids = memory.segments.all_ids()
     versions = memory.segments.versions(ids)
     new = versions < 0
     if settings.relabel == 'drawn':

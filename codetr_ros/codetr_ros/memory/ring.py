@@ -18,7 +18,8 @@ class Rollout:
 
     observations: F32  # (T, O)
     actions: F32  # (T, A)
-    rewards: F64  # (T,) the composite reward on the last step of a scored segment, 0 elsewhere
+    # (T,) the composite reward on the last step of a segment, NaN if it has none; 0 elsewhere
+    rewards: F64
     next_observations: F32  # (T, O)
     terminated: NDArray[np.bool_]  # (T,)
     last: NDArray[np.bool_]  # (T,) the next step, if any, does not follow on this one

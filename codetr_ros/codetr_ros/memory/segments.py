@@ -4,7 +4,7 @@ A segment has an id, (place of its source in the order of names << 40) | its num
 source. Arrays of ids (B,) may be in any order.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from codetr_ros.memory.batches import SegmentBatch
 from codetr_ros.memory.ring import SourceRing, ranges
 from codetr_ros.memory.scoring import anywhere, one_after_another, unscored
 from codetr_ros.memory.store import Store
+from codetr_ros.memory.table import SegmentTable
 from codetr_ros.records import F64, I64, CompositeReward
 
 SOURCE_SHIFT = 40
@@ -38,12 +39,13 @@ class Segments:
         self._delay = delay
         self._rule = one_after_another if regular else anywhere
         self._ids: I64 | None = None
+        self._all_ids: I64 | None = None
 
     # ------------------------------------------------------------------------------------------
     # changing
 
     def score(self, reward: CompositeReward) -> None:
-        """Add the composite reward of a segment whose steps are here.
+        """Add a segment whose steps are here, with its composite reward: NaN if it has none.
 
         Raises:
             RecordError: there is no such segment, or it has its reward already.
@@ -53,20 +55,28 @@ class Segments:
         self.forget()
 
     def forget(self) -> None:
-        """Drop the list of ids: it is made anew when it is next needed."""
-        self._ids = None
+        """Drop the lists of ids: they are made anew when they are next needed."""
+        self._ids = self._all_ids = None
 
     # ------------------------------------------------------------------------------------------
     # what there is
 
     def ids(self) -> I64:
-        """Ids of all scored segments, source by source in the order they were scored."""
+        """Ids of all segments with a score, source by source in the order they were scored."""
         if self._ids is None:
-            parts = [
-                segment_ids(i, s.scored.numbers()) for i, s in enumerate(self._store.by_name())
-            ]
-            self._ids = np.concatenate(parts) if parts else np.empty(0, np.int64)
+            self._ids = self._joined(lambda table: table.scored())
         return self._ids
+
+    def all_ids(self) -> I64:
+        """The same with those that have no score: all whose steps are to be labelled."""
+        if self._all_ids is None:
+            self._all_ids = self._joined(lambda table: table.numbers())
+        return self._all_ids
+
+    def _joined(self, numbers: Callable[[SegmentTable], I64]) -> I64:
+        rings = enumerate(self._store.by_name())
+        parts = [segment_ids(i, numbers(ring.scored)) for i, ring in rings]
+        return np.concatenate(parts) if parts else np.empty(0, np.int64)
 
     @property
     def nbytes(self) -> int:
@@ -74,7 +84,7 @@ class Segments:
         return sum(s.scored.nbytes(s.used) for s in self._store.sources)
 
     def scores(self, ids: I64) -> F64:
-        """Composite rewards (B,)."""
+        """Composite rewards (B,); NaN where there is none."""
         values = np.empty(len(ids), np.float64)
         for _, source, mine, at in self._by_source(ids):
             values[mine] = source.scored.values[at]

@@ -1,4 +1,4 @@
-"""The table of a source's scored segments, numbered in the order in which they were scored."""
+"""The table of a source's segments, numbered in the order in which their scores came."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ COLUMNS = ('rows', 'lengths', 'offsets', 'episodes', 'values', 'alive')
 
 
 class SegmentTable:
-    """The places of a source's scored segments, and their composite rewards.
+    """The places of a source's segments, and their composite rewards: NaN where there is none.
 
     Segment number n stands at n - `first` of every column, of which `count` entries are in use.
     The columns grow by a quarter. They move up when half of them belongs to evicted segments.
@@ -41,10 +41,16 @@ class SegmentTable:
         """The numbers of the segments that are held, ascending."""
         return np.flatnonzero(self.alive[: self.count]) + self.first
 
+    def scored(self) -> I64:
+        """The numbers of those that have a score, ascending."""
+        known = self.alive[: self.count] & ~np.isnan(self.values[: self.count])
+        return np.flatnonzero(known) + self.first
+
     def per_step(self) -> F64:
-        """The composite reward per step of each segment that is held."""
-        values: F64 = self.values[: self.count] / self.lengths[: self.count]
-        return values[self.alive[: self.count]]
+        """The composite reward per step of each segment that is held and has one."""
+        at = self.scored() - self.first
+        values: F64 = self.values[at] / self.lengths[at]
+        return values
 
     def beginning_at(self, row: int) -> int | None:
         """The number of the segment whose first step lies in a row that is held."""
@@ -72,8 +78,8 @@ class SegmentTable:
         return int(self.rows[at] + self.lengths[at]) > row
 
     def right_before(self, at: int, steps: int, most: int) -> list[int]:
-        """Numbers of the segments that lie right before one in its episode, each ending where the
-        next begins, in order.
+        """Numbers of the segments with a score that lie right before one in its episode, each
+        ending where the next begins, in order.
 
         Args:
             at: the place of that one in the table.
@@ -86,8 +92,9 @@ class SegmentTable:
             number = self._last_beginning(row, min(steps, first))
             if number is None:
                 break
-            length = int(self.lengths[number - self.first])
-            if int(self.rows[number - self.first]) + length != row:
+            place = number - self.first
+            length = int(self.lengths[place])
+            if int(self.rows[place]) + length != row or np.isnan(self.values[place]):
                 break
             numbers.append(number)
             row, first = row - length, first - length

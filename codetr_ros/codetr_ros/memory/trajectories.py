@@ -68,7 +68,7 @@ class Trajectories:
         self.store.append_true_rewards(record)
 
     def score(self, reward: CompositeReward) -> None:
-        """Add the composite reward of a segment whose steps are here.
+        """Add a segment whose steps are here, with its composite reward: NaN if it has none.
 
         Raises:
             RecordError: there is no such segment, or it has its reward already.

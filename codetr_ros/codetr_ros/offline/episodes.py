@@ -95,6 +95,7 @@ class Index:
     episodes: dict[tuple[Key, int], Episode] = field(default_factory=dict)
     steps: int = 0
     scores: int = 0
+    unscored: int = 0  # segments that state that they have no score
     skipped: Counter[str] = field(default_factory=Counter)
     notes: list[str] = field(default_factory=list)
     topics: dict[Key, str] = field(default_factory=dict)  # of their steps
@@ -226,12 +227,14 @@ class Index:
             return False
         self._copies.add(place)
         if known is not None:  # scores that arrived before their steps
-            self.scores -= len(known.firsts)
+            none = int(np.isnan(known.values).sum())
+            self.scores -= len(known.firsts) - none
+            self.unscored -= none
             del self.episodes[place]
         return True
 
     def _score(self, key: Key, reward: CompositeReward) -> None:
-        if not usable_score(reward.value):
+        if not usable_score(reward.value) and not np.isnan(reward.value):
             self.skipped[TOO_LARGE if np.isfinite(reward.value) else NOT_FINITE] += 1
             return
         place = (key, reward.episode)
@@ -243,7 +246,10 @@ class Index:
         episode.firsts.append(reward.first_step)
         episode.lengths.append(reward.length)
         episode.values.append(reward.value)
-        self.scores += 1
+        if np.isnan(reward.value):
+            self.unscored += 1
+        else:
+            self.scores += 1
 
     @property
     def longest(self) -> int:
@@ -281,7 +287,7 @@ def sound(chunk: Transitions) -> bool:
 
 
 class Segments(NamedTuple):
-    """Scored segments of one stretch, in order of their steps."""
+    """Segments of one stretch, in order of their steps; a value of NaN: without a score."""
 
     firsts: np.ndarray  # within the episode
     lengths: np.ndarray
@@ -290,7 +296,7 @@ class Segments(NamedTuple):
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Stretch:
-    """Part of an episode with its scored segments; held out or learnt from as a whole."""
+    """Part of an episode with its segments; held out or learnt from as a whole."""
 
     key: Key
     episode: int
@@ -306,9 +312,10 @@ class Stretches:
     usable: list[Stretch]
     skipped: Counter[str]
     unscored: int  # steps that no score covers
+    declared: int = 0  # of these, steps of segments that state that they have no score
 
 
-def stretches(index: Index, delay: int, longest: int) -> Stretches:
+def stretches(index: Index, delay: int, longest: int, unscored: bool = False) -> Stretches:
     """Cut the indexed episodes into stretches with scores.
 
     Args:
@@ -316,17 +323,21 @@ def stretches(index: Index, delay: int, longest: int) -> Stretches:
         delay: scores of more steps are left out.
         longest: a longer piece is cut, between two segments, into stretches of about this many
             steps.
+        unscored: whether stretches of segments without a score are usable too.
     """
     made = Stretches([], Counter(index.skipped), index.steps)
     for episode in index.episodes.values():
         segments = _sound_segments(episode, delay, made.skipped)
-        made.unscored -= int(segments.lengths.sum())
+        scored = ~np.isnan(segments.values)
+        made.unscored -= int(segments.lengths[scored].sum())
+        made.declared += int(segments.lengths[~scored].sum())
         for piece in episode.pieces:
             inside = (segments.firsts >= piece.first) & (
                 segments.firsts + segments.lengths <= piece.end
             )
             mine = Segments(*(part[inside] for part in segments))
-            made.usable += _cut(episode, piece, mine, longest)
+            cut = _cut(episode, piece, mine, longest)
+            made.usable += [s for s in cut if unscored or not np.isnan(s.segments.values).all()]
     return made
 
 

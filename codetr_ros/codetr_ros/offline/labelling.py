@@ -1,9 +1,9 @@
-"""`codetr label`: write a bag with the step rewards of all its scored segments added.
+"""`codetr label`: write a bag with the step rewards of all its segments added.
 
 The new bag holds the messages of the old one, byte for byte. At its end follow the `StepRewards`
-of every scored segment, in parts, on the topic `step_rewards` beside that of the steps. They are
-of the phase after the bag's last, so that they replace labels that a run has recorded: the later
-of two labels of a step holds.
+of every segment, in parts, on the topic `step_rewards` beside that of the steps; also of segments
+that state that they have no score. They are of the phase after the bag's last, so that they
+replace labels that a run has recorded: the later of two labels of a step holds.
 """
 
 from collections import Counter
@@ -63,8 +63,8 @@ def label(bag: Bag, saved: SavedModel, folder: Path, memory_steps: int) -> Label
     index = Index([bag]).read()
     settings = saved.settings
     method = restore(saved, settings, index.observation_size, index.action_size)
-    data = stretches(index, settings.longest, min(STRETCH_STEPS, max(1, memory_steps // 4)))
-    made = Labelled(unlabelled=data.unscored, skipped=data.skipped)
+    data = stretches(index, settings.longest, min(STRETCH_STEPS, max(1, memory_steps // 4)), True)
+    made = Labelled(unlabelled=data.unscored - data.declared, skipped=data.skipped)
     messages = _messages(bag, index, method, data.usable, memory_steps, made)
     with unfinished(folder, 'label again') as new:
         copied = copy(messages, new, f'labelled by {LIBRARY}')
@@ -162,7 +162,7 @@ def _label(
     wanted = [stretch for part in parts for stretch in part]
     delay = max(int(s.segments.lengths.max()) for s in wanted)
     loaded = load([bag], wanted, (index.observation_size, index.action_size), delay)
-    ids = loaded.memory.segments.ids()
+    ids = loaded.memory.segments.all_ids()
     labels = labels_of(method, loaded, ids)
     episodes = loaded.memory.segments.spans(ids)[0][1]
     rows = {id(s): np.flatnonzero(episodes == i) for i, s in enumerate(loaded.stretches)}

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from codetr_ros.bags.reader import Bag
@@ -72,6 +73,7 @@ def _common(
     index: Index, data: Stretches, settings: Settings, fit: FitSettings, judged: Judgement | None
 ) -> dict[str, Any]:
     sources = sorted({f'{key.run_id}/{key.source}' for key, _ in index.episodes})
+    unscored = sum(int(np.isnan(s.segments.values).sum()) for s in data.usable)
     return {
         'schedule': fit.schedule,
         'bags': [str(bag.path) for bag in index.bags],
@@ -90,7 +92,8 @@ def _common(
             'episodes': len({(s.key, s.episode) for s in data.usable}),
             'steps': index.steps,
             'steps that no score covers': data.unscored,
-            'scored segments': sum(len(s.segments.firsts) for s in data.usable),
+            'scored segments': sum(len(s.segments.firsts) for s in data.usable) - unscored,
+            **({'segments without a score': index.unscored} if index.unscored else {}),
         },
         'metrics': judged.metrics if judged else dict.fromkeys(MEASURES),
         'skipped': {name: n for name, n in data.skipped.items() if n},

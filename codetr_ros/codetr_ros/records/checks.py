@@ -65,17 +65,26 @@ def usable_score(value: float) -> bool:
     return abs(value) <= LARGEST_SCORE
 
 
-def check_score(reward: CompositeReward, delay: int) -> None:
+def check_score(reward: CompositeReward, delay: int, missing: bool = False) -> None:
     """Refuse a composite reward that no segment can have.
+
+    Args:
+        reward: the record.
+        delay: the most steps of a segment.
+        missing: whether a segment may have no score, which NaN states.
 
     Raises:
         RecordError: names the field and its value.
     """
-    if not np.isfinite(reward.value):
+    if missing and np.isnan(reward.value):
+        pass
+    elif not np.isfinite(reward.value):
+        remedy = '' if missing else '; where scores may be missing, set score_missing'
         raise RecordError(
             f'{describe(reward)}: value is {reward.value}: a composite reward must be finite'
+            f'{remedy}'
         )
-    if not usable_score(reward.value):
+    elif not usable_score(reward.value):
         raise RecordError(
             f'{describe(reward)}: value is {reward.value}: a composite reward must be from '
             f'-{LARGEST_SCORE:g} to {LARGEST_SCORE:g}'

@@ -133,7 +133,7 @@ class CompositeReward:
     episode: int
     first_step: int
     length: int
-    value: float
+    value: float  # NaN: the segment has no score (`score_missing`)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

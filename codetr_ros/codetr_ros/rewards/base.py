@@ -117,9 +117,16 @@ class RewardMethod(ABC):
         """
 
     def label_passes(self, memory: Trajectories, ids: NDArray[np.int64]) -> Iterator[F32]:
-        """Labels of the segments' steps in order, forward pass by forward pass."""
-        batch = memory.segments.batch(ids, self.context)
+        """Labels of the segments' steps in order, forward pass by forward pass.
+
+        Segments may have no score; at least one of the memory has.
+        """
+        batch = self._completed(memory, memory.segments.batch(ids, self.context))
         yield self.label(batch)[segment_steps(batch)]
+
+    def _completed(self, memory: Trajectories, batch: SegmentBatch) -> SegmentBatch:
+        """The batch with something in the place of scores that are missing, if labels need it."""
+        return batch
 
     @property
     def single_steps(self) -> bool:

@@ -18,6 +18,8 @@ the better guide to the paper's table:
   nothing is scored within a phase.
 * No heap of the best trajectories is sampled beside the memory, as in RBT's baseline.
 * Where all scores are equal, none is better than another: all labels are 0 (decided here).
+* A segment without a score is as good as one of the mean level of those that have one, within the
+  extremes (decided here).
 
 Labels are in [0, 1] by definition, so `target_scale` and `reward_unit` do not touch them. Since
 they cannot be negative, every step of survival is worth something, whatever the scores are.
@@ -26,6 +28,7 @@ The formula beside its symbols: docs/methods.md#ircr.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -36,6 +39,8 @@ from codetr_ros.memory.batches import SegmentBatch
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import F32
 from codetr_ros.rewards.base import RewardMethod, segment_steps
+from codetr_ros.rewards.evidence import links
+from codetr_ros.rewards.unscored import completed
 
 
 class Ircr(RewardMethod):
@@ -45,6 +50,7 @@ class Ircr(RewardMethod):
 
     def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
         super().__init__(settings, observation_size, action_size)
+        self._link = links.make(settings.composite, settings.beta, settings.longest)
         self._moves = 0
         self._least = self._greatest = 0.0  # meaningless before the first move
 
@@ -68,6 +74,11 @@ class Ircr(RewardMethod):
         if not self._moves or extremes != (self._least, self._greatest):
             self._least, self._greatest = extremes
             self._moves += 1
+
+    def _completed(self, memory: Trajectories, batch: SegmentBatch) -> SegmentBatch:
+        whole = completed(memory, batch, self._link)
+        within = np.clip(whole.values, self._least, self._greatest)
+        return replace(whole, values=np.where(np.isnan(batch.values), within, whole.values))
 
     def label(self, batch: SegmentBatch) -> F32:
         """Step rewards (B, L); in [0, 1] for segments whose scores `prepare` has seen."""

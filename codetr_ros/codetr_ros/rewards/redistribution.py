@@ -22,11 +22,22 @@ from codetr_ros.records import F32, F64
 from codetr_ros.rewards.base import RewardMethod, RewardModelError, segment_steps
 from codetr_ros.rewards.evidence import links
 from codetr_ros.rewards.evidence.link import Sum, level_scale
+from codetr_ros.rewards.unscored import completed
 from codetr_ros.seeding import generator
 
 
 class Redistribution(RewardMethod):
-    """A fixed rule from a segment and its composite reward to step rewards."""
+    """A fixed rule from a segment and its composite reward to step rewards.
+
+    A segment without a score is treated as if it had the mean level of those that have one.
+    """
+
+    def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
+        super().__init__(settings, observation_size, action_size)
+        self._link = links.make(settings.composite, settings.beta, settings.longest)
+
+    def _completed(self, memory: Trajectories, batch: SegmentBatch) -> SegmentBatch:
+        return completed(memory, batch, self._link)
 
     def label(self, batch: SegmentBatch) -> F32:
         """Step rewards (B, L) by the rule.
@@ -60,10 +71,6 @@ class StepReward(Redistribution):
     that of the scores per step, c. Were it c for others too, the oracle's rewards would be many
     times as large as all others under a soft maximum, and vanish where scores are squares.
     """
-
-    def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
-        super().__init__(settings, observation_size, action_size)
-        self._link = links.make(settings.composite, settings.beta, settings.longest)
 
     def prepare(self, memory: Trajectories) -> None:
         """Freeze the scale of levels, the first time."""

@@ -36,7 +36,10 @@ from codetr_ros.ros.signals import Stop
 LEARNERS = ('reward', 'learner')
 """Roles that learn from what is played; playing waits for them."""
 LOG_EVERY = 5.0  # [s] between two log lines about progress
-MUST_AGREE = ('task', 'composite', 'beta', 'delay', 'phase_steps', 'simulators', 'envs')
+MUST_AGREE = (
+    *('task', 'composite', 'beta', 'delay', 'score_missing', 'score_noise', 'score_levels'),
+    *('phase_steps', 'simulators', 'envs'),
+)
 """Settings that made the steps: a live learner must have the same."""
 
 

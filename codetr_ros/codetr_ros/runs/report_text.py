@@ -7,10 +7,23 @@ from codetr_ros.runs.numbers import column, number
 from codetr_ros.runs.run_summary import RewardRecovery, RunSummary
 
 
+def inexact(summary: RunSummary) -> str:
+    """What made the run's scores inexact, to follow their kind; empty if they were exact."""
+    settings, parts = summary.settings, []
+    if share := settings.get('score_missing'):
+        parts.append(f'{share:.0%} missing')
+    if noise := settings.get('score_noise'):
+        parts.append(f'noise of {noise:g} deviations')
+    if levels := settings.get('score_levels'):
+        parts.append(f'on {levels} levels')
+    return f' ({", ".join(parts)})' if parts else ''
+
+
 def title(summary: RunSummary) -> str:
     """Names the run in a line."""
     s = summary
-    what = f'{s.task}, {s.composite} of {delay_in_words(s.delay)}, {s.method}, seed {s.seed}'
+    given = f'{s.composite} of {delay_in_words(s.delay)}{inexact(s)}'
+    what = f'{s.task}, {given}, {s.method}, seed {s.seed}'
     return what + (' (interrupted)' if s.interrupted else '')
 
 

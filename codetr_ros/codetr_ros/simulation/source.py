@@ -1,5 +1,6 @@
 """A source: one environment whose episodes become records, chunk by chunk."""
 
+import math
 from collections import Counter
 from collections.abc import Iterator
 
@@ -21,6 +22,7 @@ from codetr_ros.records import (
 from codetr_ros.seeding import generator, seed_global
 from codetr_ros.simulation.chunks import steps_of_chunks
 from codetr_ros.simulation.episode import EpisodeRunner, Score
+from codetr_ros.simulation.scorer import Scorer, ScoreScale
 from codetr_ros.simulation.tasks import make, r_max
 
 
@@ -33,14 +35,19 @@ class Source:
         run: the run it belongs to.
         settings: the settings of the run.
         name: its name, which no other source of the run may have.
+        scale: of the task's scores; None: measured here.
 
     Raises:
         TaskError: the task is unknown or cannot be used.
         SettingsError: the delay exceeds the task's horizon.
     """
 
-    def __init__(self, run: RunSpec, settings: Settings, name: str) -> None:
+    def __init__(
+        self, run: RunSpec, settings: Settings, name: str, scale: ScoreScale | None = None
+    ) -> None:
         self.name = name
+        scale = ScoreScale.of(settings) if scale is None else scale
+        self._scorer = Scorer(settings, scale, name)
         seed_global(settings.seed, 'environment')  # one environment, whoever makes it
         self.environment = make(settings.task)
         self.counters: Counter[str] = Counter()
@@ -92,6 +99,7 @@ class Source:
                 self._episodes += 1
                 seeds = generator(self._settings.seed, 'reset', self.name, self._episodes)
                 self._episode.reset(int(seeds.integers(2**31)), self._episodes)
+                self._scorer.begin(self._episodes)
             done, records = self._chunk(policy, acting, draws[taken:], taken, scores_before)
             taken += done
             yield records
@@ -165,6 +173,9 @@ class Source:
             ),
         ]
         for score in scores:
+            given = self._scorer.given(score.value)
+            if math.isnan(given):
+                self.counters['scores missing'] += 1
             records.append(
                 CompositeReward(
                     run_id=run_id,
@@ -174,7 +185,7 @@ class Source:
                     episode=number,
                     first_step=score.first_step,
                     length=score.length,
-                    value=score.value,
+                    value=given,
                 )
             )
             self._scores += 1

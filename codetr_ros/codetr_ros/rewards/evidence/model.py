@@ -310,15 +310,18 @@ class Model:
         return value, evidence.left_out(self.theta)
 
     def labels(self, f: F64, scores: F64, m: I64) -> F64:
-        """Step rewards (N,) that explain the scores, in units of `scale`.
+        """Step rewards (N,) that explain the scores, in units of `scale`; f without a score.
 
         Args:
             f: (N,) of the segments' steps, one segment after the other.
-            scores: (S,) of the segments.
+            scores: (S,) of the segments; NaN where there is none.
             m: (S,) their steps.
         """
-        level = self.due(f, scores, m)
-        return f + np.repeat(self.link.shift(f, level, np.cumsum(m) - m, m), m)
+        missing = np.isnan(scores)
+        level = self.due(f, np.where(missing, 0.0, scores), m)
+        shift = self.link.shift(f, level, np.cumsum(m) - m, m)
+        labels: F64 = f + np.repeat(np.where(missing, 0.0, shift), m)
+        return labels
 
     def due(self, f: F64, scores: F64, m: I64) -> F64:
         """The levels (S,) of scores; of verdicts, those to be expected of steps with rewards f."""
