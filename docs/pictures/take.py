@@ -105,7 +105,7 @@ def main() -> None:
     codetr = str(Path(sys.executable).with_name('codetr'))
     output = recorded([codetr, 'train', '--out', str(folder)])
     (HERE / 'terminal.svg').write_text(drawn(screen(output), 'make train'))
-    photographed(folder.resolve() / 'report.html', HERE / 'report.png', '1000,1190')
+    photographed(folder.resolve() / 'report.html', HERE / 'report.png', '1000,1460')
 
 
 if __name__ == '__main__':

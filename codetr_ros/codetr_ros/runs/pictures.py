@@ -59,7 +59,10 @@ def line(axes: Axes, points: Sequence[tuple[float, float]], label: str, colour: 
     """A curve with its points; nothing if there are none."""
     if points:
         x, y = zip(*points, strict=True)
-        axes.plot(x, y, 'o-', color=colour, markersize=3.5, lw=1.6, label=label)
+        # the last point lies on the border
+        axes.plot(
+            x, y, 'o-', color=colour, markersize=3.5, lw=1.6, label=label, clip_on=False, zorder=3
+        )
 
 
 def scatter(axes: Axes, x: ArrayLike, y: ArrayLike, caption: str) -> None:
@@ -114,7 +117,8 @@ def curves(
     """Curves over training, a panel for each quantity.
 
     Args:
-        panels: by the name of the quantity, the points (x, y) of each curve by its label.
+        panels: by the name of the quantity, the points (x, y) of each curve by its label. A loss
+            whose values are far apart has a logarithmic axis.
         along: name of x.
         end: where x ends; None: at the last point.
         correlations: the values are such, and 0 and 1 are shown.
@@ -131,7 +135,7 @@ def curves(
             if correlations:
                 low, high = axes.get_ylim()
                 axes.set_ylim(min(low, 0.0), max(high, 1.02))
-            elif _far_apart([y for points in lines.values() for _, y in points]):
+            elif 'loss' in name and _far_apart([y for ps in lines.values() for _, y in ps]):
                 axes.set_yscale('log')
             plain(axes)
             axes.tick_params(labelsize=9)

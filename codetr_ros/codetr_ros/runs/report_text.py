@@ -110,6 +110,11 @@ def recovery_text(rows: Sequence[RewardRecovery]) -> str:
             f'{verb} {place}from {first.within:.2f} after {first.step} steps to {last.within:.2f} '
             f'after {last.step}'
         )
+        if verb == 'fell':
+            change += (
+                '. It is measured on the steps in memory, which change as the policy does, so a '
+                'fall need not mean that the model got worse'
+            )
     grade = next(text for least, text in _GRADES if last.within >= least)
     return (
         f'{grade} Their correlation with the true rewards inside segments {change}. '
