@@ -82,7 +82,10 @@ def test_every_method_can_be_benchmarked(method: str, tmp_path: Path) -> None:
         ({'delays': 25}, 'delays = 25: Input should be a valid'),
         ({'seeds': [0, 0]}, '0 twice'),
         ({'steps': 0}, 'steps = 0'),
-        ({'delay': [5]}, 'there is no key delay (value [5]). Keys are: methods, tasks'),
+        (
+            {'delay': [5]},
+            'there is no key delay (value [5]) (did you mean delays?). Keys are: methods, tasks',
+        ),
         ({'tasks': ['Ant-v99']}, "there is no task 'Ant-v99'"),
         ({'delays': [2000]}, 'cell InvertedPendulum-v5_sum_2000_codetr_seed0: delay = 2000'),
         ({'config': 'slow'}, "config.base = 'slow': neither a preset (quick, cpu, paper)"),

@@ -108,6 +108,7 @@ def test_help_shows_the_defaults_and_ranges_of_the_chosen_config(
         ('--steps -5', 'steps = -5: Input should be greater than or equal to 1'),
         ('--codetr.heads 3', 'embedding=64 is not divisible by heads=3'),
         ('--config slow', "config 'slow' is neither a preset (quick, cpu, paper) nor a file"),
+        ('--config qiuck', 'nor a file (did you mean quick?)'),
         ('--config', '--config needs a value: quick, cpu, paper or a YAML file'),
         ('--task Ant-v99', "there is no task 'Ant-v99'"),
         ('--delay 1001', 'delay = 1001: task '),

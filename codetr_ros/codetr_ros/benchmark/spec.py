@@ -28,6 +28,7 @@ from codetr_ros import config
 from codetr_ros.config import Composite, Delay, Group, Method, Settings, SettingsError
 from codetr_ros.simulation import tasks
 from codetr_ros.system.parsing import ParseError, read_yaml
+from codetr_ros.system.similar import did_you_mean
 
 DEFAULT_BASE = 'quick'
 _AXES = {
@@ -132,7 +133,8 @@ def load(path: Path) -> Spec:
         )
     if unknown := [str(key) for key in data if key not in _Keys.model_fields]:
         raise BenchmarkError(
-            f'spec {path}: there is no key {", ".join(unknown)} (value {data[unknown[0]]!r}). '
+            f'spec {path}: there is no key {", ".join(unknown)} (value {data[unknown[0]]!r})'
+            f'{did_you_mean(unknown[0], _Keys.model_fields)}. '
             f'Keys are: {", ".join(_Keys.model_fields)}; settings go under config'
         )
     try:

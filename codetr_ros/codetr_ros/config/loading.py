@@ -8,6 +8,7 @@ from typing import Any
 from codetr_ros.config.base import SettingsError, flatten, validate
 from codetr_ros.config.run import Settings
 from codetr_ros.system.parsing import ParseError, parse_json, parse_yaml, read_yaml
+from codetr_ros.system.similar import did_you_mean
 
 PRESETS = ('quick', 'cpu', 'paper')
 
@@ -40,6 +41,7 @@ def load(name: str) -> Settings:
         if not path.is_file():
             raise SettingsError(
                 f'config {name!r} is neither a preset ({", ".join(PRESETS)}) nor a file'
+                f'{did_you_mean(name, PRESETS)}'
             )
         try:
             data = read_yaml(path)
