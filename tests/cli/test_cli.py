@@ -221,6 +221,31 @@ def test_the_command_line_loads_nothing_slow_before_it_must() -> None:
         assert done.stderr.splitlines()[-1] == 'set()', arguments
 
 
+@pytest.mark.parametrize('command', ['convert', 'label'])
+def test_a_new_bag_where_nothing_can_be_written_is_refused_before_anything_is_read(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    more = {'convert': ['--mapping', 'none.yaml'], 'label': ['--checkpoint', 'none']}[command]
+
+    assert cli.main([command, 'no such bag', *more, '--out', '/proc/new']) == 2
+
+    assert capsys.readouterr().err.startswith('codetr: --out /proc/new: /proc cannot be written')
+
+
+def test_a_file_that_fails_where_nobody_expects_it_is_named_without_a_traceback(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def command(_: Sequence[str]) -> int:
+        Path('/proc/self/made').mkdir()
+        return 0
+
+    monkeypatch.setitem(cli.COMMANDS, 'tasks', command)
+
+    assert cli.main(['tasks']) == 1
+
+    assert capsys.readouterr().err.startswith('codetr: /proc/self/made: No such file or dir')
+
+
 def test_the_tasks_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(['tasks']) == 0
 

@@ -135,6 +135,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # this, the interpreter complains once more when it flushes at exit.
         sys.stdout = None
         return FAILED
+    except OSError as error:
+        if error.filename is None:
+            raise
+        from codetr_ros.system.files import FileError, remedy
+
+        own = isinstance(error, FileError)
+        text = f'{error.filename}: {error.strerror}. {remedy(error).capitalize()}'
+        print(f'codetr: {error if own else text}', file=sys.stderr)
+        return FAILED
 
 
 def refuse_command(shown: str, given: str, known: Iterable[str]) -> int:

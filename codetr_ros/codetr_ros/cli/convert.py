@@ -13,6 +13,7 @@ from codetr_ros.cli.terminal import console, parse_arguments
 from codetr_ros.config import SettingsError
 from codetr_ros.offline.errors import FitError
 from codetr_ros.records import RecordError
+from codetr_ros.system.files import FileError, check_makeable
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +34,10 @@ class Arguments:
 def main(arguments: Sequence[str]) -> int:
     """Convert and print a summary; returns the exit code."""
     given = parse_arguments(Arguments, prog='codetr convert', arguments=arguments)
+    try:
+        check_makeable(Path(given.out))
+    except FileError as error:
+        return refuse(f'--out {given.out}: {error}')
     from codetr_ros.bags.reader import Bag
     from codetr_ros.offline import mapping
     from codetr_ros.offline.conversion import HINTS

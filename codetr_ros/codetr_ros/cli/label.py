@@ -14,6 +14,7 @@ from codetr_ros.cli.terminal import console, parse_arguments
 from codetr_ros.config import SettingsError
 from codetr_ros.offline.errors import FitError
 from codetr_ros.records import RecordError
+from codetr_ros.system.files import FileError, check_makeable
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +50,10 @@ class Arguments:
 def main(arguments: Sequence[str]) -> int:
     """Label and print what was labelled; returns the exit code."""
     given = parse_arguments(Arguments, prog='codetr label', arguments=arguments)
+    try:
+        check_makeable(Path(given.out))
+    except FileError as error:
+        return refuse(f'--out {given.out}: {error}')
     if given.memory_steps < 1:
         return refuse(f'--memory-steps {given.memory_steps}: at least 1 step must be held')
     from codetr_ros.offline import labelling, sources
