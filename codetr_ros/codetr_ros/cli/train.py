@@ -10,16 +10,15 @@ import traceback
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import tyro
+from typing import TYPE_CHECKING
 
 from codetr_ros import config
-from codetr_ros.cli import FAILED, INTERRUPTED, film, refuse, results
+from codetr_ros.cli import FAILED, INTERRUPTED, refuse, results
 from codetr_ros.cli.flags import parse
 from codetr_ros.cli.terminal import console
+from codetr_ros.cli.train_flags import FLAGS, PEER_DEADLINE, wrong
 from codetr_ros.config import Settings, SettingsError
-from codetr_ros.processes import launcher, middleware
+from codetr_ros.processes import launcher
 from codetr_ros.processes.launcher import LaunchError
 from codetr_ros.processes.supervise import Interrupts, Silence, supervise, why_it_gave_up
 from codetr_ros.records import Record
@@ -39,9 +38,6 @@ DESCRIPTION = """Train on a task.
 Starts a simulator, an evaluator, the reward model, the learner and a recorder as ROS 2 nodes in a
 namespace of their own, shows their progress, and ends with a summary, a report and a picture.
 Ctrl-C ends all of it cleanly. Every setting is a flag; --config sets their defaults."""
-
-PEER_DEADLINE = 60.0
-"""Seconds that nodes wait for each other unless the user gives others."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,52 +75,8 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
     from codetr_ros.cli import tryout
     from codetr_ros.simulation import tasks
 
-    more = [
-        (
-            'out',
-            Annotated[
-                str | None,
-                tyro.conf.arg(
-                    metavar='DIR',
-                    help='output folder, new or empty; by default '
-                    'runs/<task>-<method>-<seed>-<time>',
-                ),
-            ],
-            None,
-        ),
-        (
-            'namespace',
-            Annotated[
-                str | None,
-                tyro.conf.arg(
-                    metavar='/NAME', help='namespace of the nodes; by default /run_<id>'
-                ),
-            ],
-            None,
-        ),
-        (
-            'peer_deadline',
-            Annotated[
-                float,
-                tyro.conf.arg(
-                    metavar='S',
-                    help='seconds that nodes wait for one that is missing or silent; 0: for ever',
-                ),
-            ],
-            PEER_DEADLINE,
-        ),
-        (
-            'in_process',
-            Annotated[
-                bool,
-                tyro.conf.arg(help='do the same run with plain calls, without nodes and topics'),
-            ],
-            False,
-        ),
-        ('film', Annotated[bool, tyro.conf.arg(help=film.HELP)], True),
-    ]
     try:
-        settings, extra = parse(arguments, 'codetr train', DESCRIPTION, 'quick', more)
+        settings, extra = parse(arguments, 'codetr train', DESCRIPTION, 'quick', FLAGS)
         in_process = extra['in_process']
         if settings.method in config.IN_PROCESS_ONLY and not in_process:
             return refuse(
@@ -138,8 +90,8 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
         if not in_process:
             for role in settings.roles:
                 launcher.executable(role)
-        if wrong := _wrong(extra):
-            return refuse(wrong)
+        if reason := wrong(extra):
+            return refuse(reason)
         stamp = time.strftime('%Y%m%d-%H%M%S')
         out = Path(extra['out'] or default_out(settings, stamp))
         if extra['out']:
@@ -163,16 +115,6 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
     topics = None if in_process else Topics(extra['namespace'], extra['peer_deadline'], start)
     command = shlex.join(['codetr', 'train', *arguments])
     return train(settings, run_id, folder, topics, command, extra['film'])
-
-
-def _wrong(extra: Mapping[str, Any]) -> str | None:
-    """Why flags that are no settings cannot be used; None if they can."""
-    namespace = extra['namespace']
-    if namespace is not None and extra['in_process']:
-        return '--namespace is for nodes, and --in-process starts none: leave out one of them'
-    if namespace is not None and (wrong := middleware.wrong_namespace(namespace)):
-        return wrong
-    return middleware.wrong_seconds('--peer-deadline', extra['peer_deadline'])
 
 
 def default_out(settings: Settings, stamp: str) -> str:

@@ -1,0 +1,65 @@
+"""The flags of `codetr train` that are no settings of the run."""
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
+
+import tyro
+
+from codetr_ros.cli import film
+from codetr_ros.processes import middleware
+
+PEER_DEADLINE = 60.0
+"""Seconds that nodes wait for each other unless the user gives others."""
+
+FLAGS: Sequence[tuple[str, Any, Any]] = [
+    (
+        'out',
+        Annotated[
+            str | None,
+            tyro.conf.arg(
+                metavar='DIR',
+                help='output folder, new or empty; by default runs/<task>-<method>-<seed>-<time>',
+            ),
+        ],
+        None,
+    ),
+    (
+        'namespace',
+        Annotated[
+            str | None,
+            tyro.conf.arg(metavar='/NAME', help='namespace of the nodes; by default /run_<id>'),
+        ],
+        None,
+    ),
+    (
+        'peer_deadline',
+        Annotated[
+            float,
+            tyro.conf.arg(
+                metavar='S',
+                help='seconds that nodes wait for one that is missing or silent; 0: for ever',
+            ),
+        ],
+        PEER_DEADLINE,
+    ),
+    (
+        'in_process',
+        Annotated[
+            bool,
+            tyro.conf.arg(help='do the same run with plain calls, without nodes and topics'),
+        ],
+        False,
+    ),
+    ('film', Annotated[bool, tyro.conf.arg(help=film.HELP)], True),
+]
+"""Name, annotated type and default of each."""
+
+
+def wrong(extra: Mapping[str, Any]) -> str | None:
+    """Why flags that are no settings cannot be used; None if they can."""
+    namespace = extra['namespace']
+    if namespace is not None and extra['in_process']:
+        return '--namespace is for nodes, and --in-process starts none: leave out one of them'
+    if namespace is not None and (reason := middleware.wrong_namespace(namespace)):
+        return reason
+    return middleware.wrong_seconds('--peer-deadline', extra['peer_deadline'])
