@@ -228,7 +228,13 @@ class LrrSettings(PerceptronSettings):
         1.0, gt=0, le=1e6, description='deviation of step rewards from their mean at the start'
     )
     noise: float = Field(0.1, gt=0, le=1e6, description='deviation of the noise at the start')
-    batch: int = Field(64, ge=1, le=65536, description='segments in a gradient step')
+    batch: int = Field(
+        64,
+        ge=1,
+        le=65536,
+        description='segments in a gradient step, whose time grows with the cube of their length; '
+        'published: 4 whole episodes',
+    )
     learning_rate: float = Field(1e-3, gt=0, le=1, description='AdamW learning rate')
     gradient_norm: float = Field(
         1.0, gt=0, le=1e6, description='largest norm of a gradient; longer ones are shortened'
