@@ -100,6 +100,7 @@ def newest_policy(folder: Path, settings: Settings) -> Policy:
         LearnerError: its settings differ from those in the run's folder.
     """
     from codetr_ros.learners import registry
+    from codetr_ros.learners.base import LearnerError
     from codetr_ros.policy.actor import weights_bytes
     from codetr_ros.runs import checkpoints
 
@@ -117,8 +118,18 @@ def newest_policy(folder: Path, settings: Settings) -> Policy:
             f'{path} is from the warm-up ({settings.warmup_steps} steps): '
             'its policy has learnt nothing yet'
         )
-    learner = registry.make(settings, meta['observation_size'], meta['action_size'])
-    learner.load_state({name: t for name, t in tensors.items() if not name.startswith('labels/')})
+    sizes = checkpoints.sizes_of(meta, path)
+    state = {name: t for name, t in tensors.items() if not name.startswith('labels/')}
+    if sum(sizes) > sum(tensor.numel() for tensor in state.values()):
+        raise checkpoints.CheckpointError(
+            f'checkpoint {path}: observation_size = {sizes[0]} and action_size = {sizes[1]} are '
+            'more than its tensors have numbers: it is damaged'
+        )
+    learner = registry.make(settings, *sizes)
+    try:
+        learner.load_state(state)
+    except LearnerError as error:
+        raise LearnerError(f'checkpoint {path}: {error}') from None
     return Policy(
         run_id='evaluate',
         phase=phase + settings.lag,

@@ -18,6 +18,7 @@ from codetr_ros.rewards.sequence import SequenceMethod
 from codetr_ros.runs import checkpoints
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.checkpoints import CheckpointError
+from codetr_ros.system.parsing import shortened
 
 _log = logging.getLogger(__name__)
 
@@ -70,16 +71,25 @@ def read(path: Path) -> SavedModel:
             f'fit or a run with {run_folder.CHECKPOINTS}/{ROLE}-... in it'
         )
     tensors, meta = checkpoints.load(chosen)
-    try:
-        settings = from_canonical(meta['settings'], f'checkpoint {chosen}')
-        settings = settings.within(meta.get('horizon', LONGEST))
-        sizes = int(meta['observation_size']), int(meta['action_size'])
-        task = str(meta['task'])
-    except KeyError as error:
+    for name in ('settings', 'task'):
+        if name not in meta:
+            raise CheckpointError(
+                f'checkpoint {chosen} lacks {name!r}: it is not that of a reward model'
+            )
+        if not isinstance(meta[name], str):
+            raise CheckpointError(
+                f'checkpoint {chosen}: {name} = {shortened(repr(meta[name]))} must be a text: it '
+                'is damaged'
+            )
+    horizon = meta.get('horizon', LONGEST)
+    if type(horizon) is not int or horizon < 1:
         raise CheckpointError(
-            f'checkpoint {chosen} lacks {error}: it is not that of a reward model'
-        ) from None
-    return SavedModel(chosen, tensors, settings, task, sizes)
+            f'checkpoint {chosen}: horizon = {shortened(repr(horizon))} must be a whole number of '
+            'steps: it is damaged'
+        )
+    settings = from_canonical(meta['settings'], f'checkpoint {chosen}').within(horizon)
+    sizes = checkpoints.sizes_of(meta, chosen)
+    return SavedModel(chosen, tensors, settings, meta['task'], sizes)
 
 
 def restore(
@@ -112,7 +122,15 @@ def restore(
             "the checkpoint's settings (its run's or fit's config.yaml), or fit another model"
         )
     method = registry.make(settings, observation_size, action_size)
-    method.load_state(saved.tensors)
+    try:
+        method.load_state(saved.tensors)
+    except RewardModelError as error:
+        raise RewardModelError(f'checkpoint {saved.path}: {error}') from None
+    if method.target_scale < 0:
+        raise RewardModelError(
+            f'checkpoint {saved.path} is damaged although its sha256 is right: target_scale = '
+            f'{method.target_scale:g} must not be negative'
+        )
     if not method.target_scale:
         raise RewardModelError(
             f'checkpoint {saved.path} was saved before anything was scored: it has learnt nothing'

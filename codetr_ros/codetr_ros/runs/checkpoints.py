@@ -23,9 +23,12 @@ import safetensors.torch
 import torch
 
 from codetr_ros.system.files import make_folder, sync_folder, write_synced
+from codetr_ros.system.parsing import brief, parse_json, shortened
 
 TENSORS = 'tensors.safetensors'
 DESCRIPTION = 'checkpoint.json'
+MOST_VALUES = 1_000_000
+"""The most numbers of an observation or action of a checkpoint."""
 FORMAT = 1
 """Increased whenever the layout of a checkpoint changes its meaning."""
 
@@ -148,14 +151,14 @@ def load(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
             ) from error
 
     try:
-        description = json.loads(content[DESCRIPTION])
+        description = parse_json(content[DESCRIPTION])
         stored = description.pop('sha256')
         actual = hashlib.sha256(_canonical(description)).hexdigest()
     except (ValueError, TypeError, AttributeError, KeyError) as error:
         actual = hashlib.sha256(content[DESCRIPTION]).hexdigest()
         raise CheckpointError(
             f'checkpoint file {path / DESCRIPTION} is damaged: not a description with its sha256 '
-            f'({type(error).__name__}: {error}; the file has sha256 {actual}): {remedy}'
+            f'({type(error).__name__}: {brief(error)}; the file has sha256 {actual}): {remedy}'
         ) from None
     if stored != actual:
         raise CheckpointError(_damaged(path / DESCRIPTION, actual, stored, remedy))
@@ -164,10 +167,51 @@ def load(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
             f'checkpoint {path} has format {description.get("format")!r}, but this version reads '
             f'{FORMAT}: read it with the version that wrote it'
         )
+    for name, kind in (('tensors_sha256', str), ('digest', str), ('meta', dict)):
+        if not isinstance(description.get(name), kind):
+            raise CheckpointError(
+                f'checkpoint file {path / DESCRIPTION} is damaged although its sha256 is right: '
+                f'{name} = {shortened(repr(description.get(name)))} must be of type '
+                f'{kind.__name__}: {remedy}'
+            )
     actual, stored = hashlib.sha256(content[TENSORS]).hexdigest(), description['tensors_sha256']
     if stored != actual:
         raise CheckpointError(_damaged(path / TENSORS, actual, stored, remedy))
-    return safetensors.torch.load(content[TENSORS]), description['meta']
+    tensors = _tensors(content[TENSORS], path / TENSORS, remedy)
+    if (actual := digest(tensors)) != (stored := description['digest']):
+        raise CheckpointError(
+            f'checkpoint file {path / TENSORS} is damaged although its sha256 is right: the '
+            f'digest of its tensors is {actual}, should be {stored}: {remedy}'
+        )
+    return tensors, description['meta']
+
+
+def sizes_of(meta: Mapping[str, Any], path: Path) -> tuple[int, int]:
+    """The sizes of observations and actions, by the `meta` of a checkpoint.
+
+    Raises:
+        CheckpointError: it has none, or no whole numbers of 1 to `MOST_VALUES`.
+    """
+    sizes = []
+    for name in ('observation_size', 'action_size'):
+        size = meta.get(name)
+        if type(size) is not int or not 1 <= size <= MOST_VALUES:
+            raise CheckpointError(
+                f'checkpoint {path}: {name} = {shortened(repr(size))} must be a whole number from '
+                f'1 to {MOST_VALUES}: it is damaged, or not that of a reward model or learner'
+            )
+        sizes.append(size)
+    return sizes[0], sizes[1]
+
+
+def _tensors(data: bytes, file: Path, remedy: str) -> dict[str, torch.Tensor]:
+    try:
+        return safetensors.torch.load(data)
+    except (safetensors.SafetensorError, ValueError, LookupError, TypeError) as error:
+        raise CheckpointError(
+            f'checkpoint file {file} is damaged although its sha256 is right: it holds no tensors '
+            f'({type(error).__name__}: {brief(error)}): {remedy}'
+        ) from None
 
 
 def latest(folder: Path, name: str) -> Path | None:
