@@ -20,8 +20,12 @@ SCORE_LATE = 'scores that came later than `late`'
 SCORE_AHEAD = 'scores whose stamp is later than the end of the bag'
 SCORE_WITHOUT_EPISODE = 'scores of an episode that is not there'
 SCORE_OF_NAMESAKES = 'scores whose `id` is that of more than one episode'
+JOINTS_DOUBLED = 'messages whose joints jump there and back, kept'
 
 HINTS = {
+    JOINTS_DOUBLED: 'two nodes seem to publish the same joints on one topic, as '
+    'joint_state_publisher may beside a driver. The bag does not show which message is of which: '
+    'record again with one of them, or filter its messages out of the bag',
     SCORE_OF_EITHER: 'when a score comes while an episode runs, and the end of the one before had '
     'no score, the bag does not show which one it is of. Give score.late: 0 if scores never come '
     'after the next episode has begun, or the seconds by which they may; or let score.of be '

@@ -25,7 +25,8 @@ import numpy as np
 
 from codetr_ros.bags.reader import Message
 from codetr_ros.offline import mapping
-from codetr_ros.offline.conversion import Conversion
+from codetr_ros.offline.conversion import JOINTS_DOUBLED, Conversion
+from codetr_ros.offline.doubled_joints import DoubledJoints
 from codetr_ros.offline.episode_scores import EpisodeScores
 from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.mapping import Mapping
@@ -81,6 +82,7 @@ class Converter:
         self._cut: int | None = None  # when steps of an episode were lost last, as it went on
         self._scores = EpisodeScores(rules, run_id, self.conversion)
         self._sequence = 0
+        self._joints: dict[mapping.Values, DoubledJoints] = {}
 
     def feed(self, message: Message) -> Iterator[Timed]:
         """Take a message; yields the records that it completes.
@@ -114,6 +116,8 @@ class Converter:
         """End the last episode; yields its records."""
         yield from self._end_all()
         yield from self._give_scores()
+        if jumps := sum(joints.count for joints in self._joints.values()):
+            self.conversion.dropped[JOINTS_DOUBLED] += jumps
 
     def _end_all(self) -> Iterator[Timed]:
         """Do what is due by now, and end the episode."""
@@ -137,6 +141,8 @@ class Converter:
 
     def _numbers(self, message: Message, values: mapping.Values) -> F64 | None:
         array = mapping.numbers(message.message, values)
+        if array is not None and values.joints:
+            self._joints.setdefault(values, DoubledJoints()).take(array)
         if array is None:
             twice = mapping.names_a_joint_twice(message.message, values)
             self.conversion.dropped[JOINT_TWICE if twice else NO_JOINTS] += 1
