@@ -38,7 +38,8 @@ from codetr_ros.runs import reports
 from codetr_ros.runs.reports import CoreReport
 
 ACK_DEADLINE = 5.0  # [s] at the end for readers that still lack something
-STOPPED_DEADLINE = 0.1  # [s] the same if the process was asked to stop
+STOPPED_DEADLINE = 0.5
+"""The same [s] if the process was asked to stop. Who misses its leave takes it for dead."""
 SHUTDOWN_DEADLINE = 8  # [s] for the middleware to shut down, after everything is saved and sent:
 # well before `launcher.STOP_DEADLINE`, which counts from the signal
 LAST_PRESENCES = 5  # enough for the middleware to request acknowledgements
