@@ -64,7 +64,12 @@ def test_what_the_command_that_did_the_run_knew_is_kept(folder):
     assert cli.main(['report', '--no-film', str(folder)]) == 0
     before = run_summary.read(folder / run_folder.SUMMARY)
     known = before.model_copy(
-        update={'failure': 'sim was ended by SIGKILL', 'wall_s': 77.0, 'versions': {'torch': '1'}}
+        update={
+            'failure': 'sim was ended by SIGKILL',
+            'wall_s': 77.0,
+            'versions': {'torch': '1'},
+            'processes': before.processes | {'codetr': before.processes['sim-sim']},
+        }
     )
     run_summary.write(folder, known)
     for name in (run_folder.METRICS, run_folder.REPORT, run_folder.PICTURE):
@@ -85,7 +90,6 @@ def test_nodes_that_gave_up_or_were_stopped_are_a_failure_or_an_interruption(fol
     assert cli.main(['report', '--no-film', str(folder)]) == 0
     assert (summary_of(folder)['interrupted'], summary_of(folder)['failure']) == (True, None)
 
-    (folder / run_folder.SUMMARY).unlink()
     reports.write(path, stopped.model_copy(update={'error': 'training has diverged'}))
     assert cli.main(['report', '--no-film', str(folder)]) == 0
     assert summary_of(folder)['failure'] == 'learner: training has diverged'

@@ -21,6 +21,8 @@ from codetr_ros.runs.reports import NodeReport
 from codetr_ros.runs.run_summary import RunSummary
 from codetr_ros.runs.summary import Summary
 
+OWN = 'codetr'
+"""What a summary calls the process of `codetr train`."""
 BENCHMARK = 'benchmark.json'
 """Lies in the folder of a benchmark: `benchmark.folder.INDEX`, which is slow to import."""
 
@@ -134,8 +136,8 @@ def from_bag(
     """
     run_id, settings, began, seconds = _recorded(bag)
     before = found.before
-    if before is not None and before.run_id != run_id:
-        before = None  # of another run
+    if before is not None and (before.run_id != run_id or OWN not in before.processes):
+        before = None  # of another run, or made by this command, perhaps while the run went on
     summary = Summary(settings, run_id, in_process=False)
     summary.start = began
     results.complete(summary, bag, log)
@@ -186,11 +188,10 @@ def _recorded(bag: Path) -> tuple[str, Settings, datetime, float]:
 
 def _kept(built: RunSummary, before: RunSummary | None) -> dict[str, object]:
     """What only the process that has done the run could know: what it took, and its versions."""
-    own = 'codetr'
-    processes = {name: use for name, use in built.processes.items() if name != own}
+    processes = {name: use for name, use in built.processes.items() if name != OWN}
     if before is None:
         return {'processes': processes, 'host': None}
-    taken = {own: before.processes[own]} if own in before.processes else {}
+    taken = {OWN: before.processes[OWN]}
     kept = {name: getattr(before, name) for name in ('versions', 'began', 'host', 'command')}
     return {'processes': processes | taken, **kept}
 
