@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from codetr_ros.runs.numbers import column, exact, number
+from codetr_ros.runs.numbers import column, exact, number, returns
 
 
 @pytest.mark.parametrize(
@@ -55,3 +55,16 @@ def test_the_numbers_of_a_column_have_the_same_decimals():
     assert column([0.999859, 0.00565, 3.2e-05]) == ['1.000', '0.006', '0.000']
     assert column([123456.7, -3.0]) == ['123457', '-3']
     assert column([]) == []
+
+
+def test_returns_have_a_decimal_and_small_ones_more():
+    assert returns(9358.684, 0.3) == ['9358.7', '0.3']
+    assert returns(-5.934, 1.2) == ['-5.934', '1.200']
+    assert returns(6.512e-06, None) == ['0.00000651', '']
+
+
+def test_numbers_of_a_tiny_scale_keep_their_digits():
+    assert column([6.512e-06, -1.2e-07]) == ['0.00000651', '-0.00000012']
+    assert number(6.512e-06, scale=1e-05) == '0.000006512'
+    assert number(1e-12, scale=1e-05) == '< 0.000000001'
+    assert number(0.5, scale=1e6) == '< 100'

@@ -9,6 +9,7 @@ from codetr_ros.benchmark.anchors import Anchors
 from codetr_ros.benchmark.statistics import CONFIDENCE, REPLICATES, SIGNIFICANCE
 from codetr_ros.benchmark.table import ORACLES, TABLE_DELAYS, Aggregate, Entry, Row
 from codetr_ros.runs.document import Block, Bold, Heading, Items, Paragraph, Table
+from codetr_ros.runs.numbers import returns as returns_of
 
 NONE = '–'
 """Shown where there is no value."""
@@ -149,16 +150,22 @@ def returns(together: Sequence[Row], alone: Sequence[Row]) -> list[Block]:
     for task in dict.fromkeys(row.task for row in alone):
         rows = _rows(task, together, alone)
         order = _methods(rows)
+        digits = _return_digits([e.return_mean for row in rows for e in row.entries])
         lines: list[list[str | Bold]] = []
         for row in rows:
             by_method = {entry.method: entry for entry in row.entries}
             line: list[str | Bold] = [row.composite, _delays(row)]
             for method in order:
                 e = by_method.get(method)
-                line.append(_score(e, e.return_mean, e.return_spread, 1) if e else NONE)
+                line.append(_score(e, e.return_mean, e.return_spread, digits) if e else NONE)
             lines.append(line)
         blocks += [Heading(task, 3), Table(['composite', 'delay', *order], lines)]
     return blocks
+
+
+def _return_digits(means: Sequence[float | None]) -> int:
+    """Decimals of the returns of a task."""
+    return 1 if max((abs(mean) for mean in means if mean is not None), default=0.0) >= 10 else 3
 
 
 def interquartile(aggregates: Sequence[Aggregate], together: Sequence[Row]) -> list[Block]:
@@ -213,7 +220,7 @@ def anchors(known: Anchors) -> list[Block]:
             composite,
             str(delay),
             *(f'{by[policy]["score_mean"]:.4f}' for policy in ('random', 'zero')),
-            *(f'{by[policy]["true_return_mean"]:.1f}' for policy in ('random', 'zero')),
+            *returns_of(*(by[policy]['true_return_mean'] for policy in ('random', 'zero'))),
         ]
         for (task, composite, delay), by in known.items()
     ]

@@ -20,6 +20,7 @@ from codetr_ros.records import (
 )
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import report
+from codetr_ros.runs.numbers import returns
 from codetr_ros.runs.recovery import RecoveryError
 from codetr_ros.runs.run_summary import RunSummary
 from codetr_ros.runs.summary import Summary
@@ -108,9 +109,10 @@ def show(summary: RunSummary, folder: Path, console: Console) -> None:
     if summary.evaluations and len(known) == len(values):
         curve = report.sketch(known, console.encoding)
         begins = 'random policy' if summary.random else f'{summary.evaluations[0].step} steps'
+        begin, end = returns(known[0], known[-1])
         console.print(
             f'\ntrue return, {begins} to {summary.evaluations[-1].step} steps: '
-            f'{known[0]:.1f} |{curve}| {known[-1]:.1f}',
+            f'{begin} |{curve}| {end}',
             highlight=False,
             markup=False,
         )

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from codetr_ros.runs.numbers import exact, number
+from codetr_ros.runs.numbers import exact
 from codetr_ros.runs.segments import Segment
 
 TRUE, INFERRED, GREY = '#1f5fa8', '#b8561c', '#555555'
@@ -83,8 +83,8 @@ def segment(one: Segment) -> bytes:
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
         steps = one.first + np.arange(len(one.labels))
-        score = 'score not known' if one.value is None else f'score {number(one.value)}'
-        predicted = '' if one.predicted is None else f', predicted {number(one.predicted)}'
+        score = 'score not known' if one.value is None else f'score {exact(one.value, 4)}'
+        predicted = '' if one.predicted is None else f', predicted {exact(one.predicted, 4)}'
         axes.set_title(f'{one.source}, episode {one.episode}: {score}{predicted}', fontsize=9)
         axes.xaxis.get_major_locator().set_params(integer=True)
         axes.set_xlabel('step of the episode', fontsize=8)

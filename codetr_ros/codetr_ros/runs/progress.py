@@ -17,7 +17,7 @@ from rich.text import Text
 from codetr_ros.config import Settings
 from codetr_ros.records import Commit, EpisodeResult, Metrics, Presence, Record
 from codetr_ros.runs.display import Display
-from codetr_ros.runs.numbers import exact
+from codetr_ros.runs.numbers import exact, returns
 
 _RATE_WINDOW = 5  # phases over which the present speed is measured
 
@@ -124,7 +124,8 @@ class Progress(Display):
         true = np.array([r.true_return for r in results])
         score = float(np.mean([r.score for r in results]))
         many = f'{len(results)} episode' + ('s' if len(results) > 1 else '')
-        return f'true return {true.mean():.1f} +- {true.std():.1f}, score {score:.3f} ({many})'
+        mean, spread = returns(float(true.mean()), float(true.std()))
+        return f'true return {mean} +- {spread}, score {score:.3f} ({many})'
 
     def _facts(self) -> list[tuple[str, str]]:
         left = self.seconds_left

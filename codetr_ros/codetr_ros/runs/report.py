@@ -162,11 +162,12 @@ def _evaluations(summary: RunSummary) -> Block:
         *(row.true_return_max for row in rows),
     ]
     alike = column(returns)
+    scores = column([*(row.score_mean for row in rows), *(row.score_std for row in rows)])
     columns = [
         [str(row.step) for row in rows],
         *(alike[i : i + len(rows)] for i in range(0, len(alike), len(rows))),
-        column([row.score_mean for row in rows]),
-        column([row.score_std for row in rows]),
+        scores[: len(rows)],
+        scores[len(rows) :],
         column([row.length_mean for row in rows], most=1),
         [str(row.episodes) for row in rows],
     ]

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from codetr_ros.config import delay_in_words
-from codetr_ros.runs.numbers import column, number
+from codetr_ros.runs.numbers import exact, number, returns
 from codetr_ros.runs.run_summary import RewardRecovery, RunSummary
 
 
@@ -30,17 +30,19 @@ def title(summary: RunSummary) -> str:
 def result_rows(summary: RunSummary) -> list[tuple[str, str]]:
     """The few numbers that people look for first, for the page and the terminal."""
 
-    def shown(value: float | None, form: str) -> str:
-        return 'not evaluated' if value is None else format(value, form)
+    def score(value: float | None) -> str:
+        return 'not evaluated' if value is None else f'{value:.3f}'
 
     last = summary.evaluations[-1] if summary.evaluations else None
-    spread = f' +- {last.true_return_std:.1f}' if last and last.true_return_std is not None else ''
+    std = last.true_return_std if last else None
+    final, spread = returns(summary.final_true_return, std)
+    (random,) = returns(summary.random_true_return)
     after = f' after {last.step} steps' if last else ''
     return [
-        ('score', f'{shown(summary.final_score, ".3f")}{after}'),
-        ('score of the random policy', shown(summary.random_score, '.3f')),
-        ('true return', f'{shown(summary.final_true_return, ".1f")}{spread}'),
-        ('true return of the random policy', shown(summary.random_true_return, '.1f')),
+        ('score', f'{score(summary.final_score)}{after}'),
+        ('score of the random policy', score(summary.random_score)),
+        ('true return', (final or 'not evaluated') + (f' +- {spread}' if spread else '')),
+        ('true return of the random policy', random or 'not evaluated'),
         ('reward recovery', _recovery(summary)),
         ('steps', f'{summary.steps} of {summary.steps_planned}'),
         ('phases', f'{summary.phases} of {summary.phases_planned}'),
@@ -72,7 +74,7 @@ def learnt(summary: RunSummary) -> str:
     if last is None:
         return ''
     score = f', a score of {summary.final_score:.3f}' if summary.final_score is not None else ''
-    values = column([last, random])
+    values = returns(last, random)
     than = f' The random policy earns {values[1]}.' if random is not None else ''
     return (
         f'After {summary.evaluations[-1].step} steps the policy earns {values[0]} an episode'
@@ -128,14 +130,16 @@ def scale_text(summary: RunSummary) -> str:
     last = summary.reward_recovery[-1] if summary.reward_recovery else None
     if last is None or last.inferred_mean is None or last.inferred_std is None:
         return ''
+    values = (last.inferred_mean, last.inferred_std, last.true_mean, last.true_std)
+    scale = max(abs(value) for value in values if value is not None) or 1.0
+    inferred, about, true, around = (number(value, scale=scale) for value in values)
     text = (
-        f'Over the {last.steps} labelled steps in memory, an inferred reward is '
-        f'{number(last.inferred_mean)} +- {number(last.inferred_std)} (mean and standard '
-        f'deviation), a true one {number(last.true_mean)} +- {number(last.true_std)}.'
+        f'Over the {last.steps} labelled steps in memory, an inferred reward is {inferred} +- '
+        f'{about} (mean and standard deviation), a true one {true} +- {around}.'
     )
     if summary.label_unit is None or summary.label_unit == 1:
         return text
-    unit = number(summary.label_unit)
+    unit = exact(summary.label_unit, 4)
     return f'{text} The policy learns from the inferred ones in units of {unit}.'
 
 
