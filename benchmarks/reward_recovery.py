@@ -89,6 +89,7 @@ VARIANTS: dict[str, dict[str, object]] = {
     'method lrr, independent steps': {'method': 'lrr', 'lrr.correlation': 'none'},
     'method mil_lstm': {'method': 'mil_lstm'},
     'method mlp': {'method': 'mlp'},
+    'method aggregate': {'method': 'aggregate'},
     'method ircr': {'method': 'ircr'},
     'method evidence': {'method': 'evidence'},
     'method evidence, link chosen': {'method': 'evidence', 'evidence.link': 'choose'},

@@ -31,6 +31,7 @@ CASES = [
     (PENDULUM, 'lrr', 'lock-step'),
     (REACHER, 'diaster', 'overlap'),
     (PENDULUM, 'mil_lstm', 'lock-step'),
+    (REACHER, 'aggregate', 'overlap'),
     (REACHER, 'evidence', 'lock-step'),
     (PENDULUM, 'evidence', 'overlap'),
 ]

@@ -353,6 +353,10 @@ class TestMlp(PerceptronContract):
     method = 'mlp'
 
 
+class TestAggregate(PerceptronContract):
+    method = 'aggregate'
+
+
 class TestIrcr(Contract):
     method = 'ircr'
     has_unit = False

@@ -21,6 +21,7 @@ from codetr_ros.config.loading import (
     parse,
 )
 from codetr_ros.config.methods import (
+    AggregateSettings,
     CodetrSettings,
     DiasterSettings,
     HcSettings,
@@ -39,6 +40,7 @@ __all__ = [
     'IN_PROCESS_ONLY',
     'PRESETS',
     'SCORE_LEARNERS',
+    'AggregateSettings',
     'CodetrSettings',
     'Composite',
     'Delay',

@@ -164,6 +164,12 @@ class MlpSettings(PerceptronSettings):
     batch: int = Field(64, ge=1, le=65536, description='segments in a gradient step')
 
 
+class AggregateSettings(PerceptronSettings):
+    """What a segment is worth so far, told by three numbers carried through it."""
+
+    batch: int = Field(64, ge=1, le=65536, description='segments in a gradient step')
+
+
 class RrdSettings(PerceptronSettings):
     """Randomized return decomposition (Ren et al., arXiv 2111.13485)."""
 

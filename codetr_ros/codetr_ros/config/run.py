@@ -16,6 +16,7 @@ from pydantic import Field, model_validator
 from codetr_ros.config.base import Group, SettingsError, flatten, in_words, validate
 from codetr_ros.config.delays import Delay, Delayed
 from codetr_ros.config.methods import (
+    AggregateSettings,
     CodetrSettings,
     DiasterSettings,
     EvidenceSettings,
@@ -59,6 +60,7 @@ Method = Literal[
     'hc',
     'lirpg',
     'mlp',
+    'aggregate',
     'evidence',
     'uniform',
     'random',
@@ -220,6 +222,9 @@ class Settings(Schedule, Delayed, Group):
     )
     mlp: MlpSettings = Field(
         default_factory=MlpSettings, description='the reward model of single steps'
+    )
+    aggregate: AggregateSettings = Field(
+        default_factory=AggregateSettings, description='the learnt aggregator'
     )
     evidence: EvidenceSettings = Field(
         default_factory=EvidenceSettings,

@@ -1,6 +1,7 @@
 """The reward methods, from composite rewards to step rewards, behind one small protocol."""
 
 from codetr_ros.config import Settings
+from codetr_ros.rewards.aggregate import Aggregate
 from codetr_ros.rewards.base import RewardMethod, RewardModelError
 from codetr_ros.rewards.codetr import Codetr
 from codetr_ros.rewards.diaster import Diaster
@@ -28,6 +29,7 @@ METHODS: dict[str, type[RewardMethod]] = {
         Lrr,
         MilLstm,
         Mlp,
+        Aggregate,
         Evidence,
         Uniform,
         Random,
