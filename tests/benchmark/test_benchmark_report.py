@@ -126,6 +126,16 @@ def test_delays_outside_25_to_200_count_in_the_own_table_and_not_beside_the_pape
     assert entries(together[0])['none'].mean == pytest.approx((5 + 25 + 200 + 500) / 4000)
 
 
+def test_drawn_lengths_and_whole_episodes_have_rows_of_their_own_after_shorter_ones(
+    tmp_path: Path,
+) -> None:
+    folder = benchmark(tmp_path / 'b', lambda cell: 0.5, delays=['episode', 50, '10:50', 25])
+    together, alone = table.rows(results.read([folder.path]))
+
+    assert [row.delays for row in together] == [(25, 50)]
+    assert [row.delays for row in alone] == [(25,), ('10:50',), (50,), ('episode',)]
+
+
 def test_the_interquartile_mean_is_that_of_the_middle_half() -> None:
     values = [9.0, -100.0, 1.0, 2.0, 3.0, 4.0, 1000.0, 5.0]
 
@@ -211,20 +221,21 @@ def test_a_curve_has_the_mean_and_the_range_of_the_seeds(made: list[results.Resu
     assert curves.curve(some, 'reward_recovery', 'spearman')[0] == [], 'None is no number'
 
 
+@pytest.mark.parametrize('delay', [7, '2:9', 'episode'])
 def test_anchors_score_as_an_evaluation_does_and_are_simulated_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    delay: int | str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = benchmark(tmp_path / 'b', lambda cell: None, composites=['max'], delays=[7])
+    folder = benchmark(tmp_path / 'b', lambda cell: None, composites=['max'], delays=[delay])
     found = results.read([folder.path])
     file = tmp_path / 'anchors.json'
 
-    said = anchors.anchors(found, file)['InvertedPendulum-v5', 'max', 7]
+    said = anchors.anchors(found, file)['InvertedPendulum-v5', 'max', delay]
 
     random = evaluated(config.load(str(folder.settings(found[0].cell))))
     assert said['random']['score_mean'] == pytest.approx(np.mean([r.score for r in random]))
     assert said['random']['true_return_mean'] == np.mean([r.true_return for r in random])
     monkeypatch.setattr(anchors, 'simulate', lambda *_: pytest.fail('simulated again'))
-    assert anchors.anchors(found, file)['InvertedPendulum-v5', 'max', 7] == said
+    assert anchors.anchors(found, file)['InvertedPendulum-v5', 'max', delay] == said
 
 
 def evaluated(settings: config.Settings) -> list[EpisodeResult]:

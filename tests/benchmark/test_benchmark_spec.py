@@ -34,6 +34,22 @@ def test_the_cells_are_all_combinations_with_readable_names_seed_by_seed(tmp_pat
     assert (last.method, last.composite, last.delay, last.steps) == ('none', 'max', 10, 300)
 
 
+def test_delays_may_be_drawn_or_whole_episodes_and_scores_inexact(tmp_path: Path) -> None:
+    path = tmp_path / 'spec.yaml'
+    keys = {**SMALL, 'delays': ['10-50', 'episode', 5], 'config': {'score_missing': 0.3}}
+    path.write_text(yaml.safe_dump(keys).replace('10-50', '10:50'))  # without quotes
+    made = spec.load(path)
+    cells = {cell.settings.delay: cell for cell in made.cells if cell.settings.seed == 0}
+
+    assert list(cells) == ['10:50', 'episode', 5]
+    assert cells['10:50'].name == 'InvertedPendulum-v5_max_10-50_none_seed0'
+    assert cells['episode'].name == 'InvertedPendulum-v5_max_episode_none_seed0'
+    assert all(cell.settings.score_missing == 0.3 for cell in made.cells)
+    again = tmp_path / 'again.yaml'
+    again.write_text(made.to_yaml())
+    assert spec.load(again).cells == made.cells
+
+
 def test_without_config_a_cell_has_the_settings_of_the_quick_preset(tmp_path: Path) -> None:
     cell = spec.load(write(tmp_path)).cells[0]
 

@@ -63,6 +63,8 @@ def test_the_chosen_config_decides_the_defaults_that_other_flags_override(tmp_pa
 
     assert parse('--config', 'paper') == config.load('paper')
     assert parse('--delay', '50', '--config=cpu') == config.load('cpu').changed({'delay': 50})
+    for delay in ('10:50', 'episode'):
+        assert parse('--delay', delay) == config.load('quick').changed({'delay': delay})
     mine = parse('--config', str(file), '--steps', '1000')
     assert (mine.delay, mine.steps) == (7, 1000)
 

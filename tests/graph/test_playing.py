@@ -33,9 +33,11 @@ class Recorded:
 @pytest.fixture(scope='module')
 def recorded(tmp_path_factory):
     """Overlap: two phases are under way at once. All labels, so that they can be played too. Two
-    environments: the simulator that is played speaks for two sources.
+    environments: the simulator that is played speaks for two sources. Irregular segments, of which
+    some have no score.
     """
-    settings = tiny(overlap=True, record_relabels='all', evaluate_every=0, envs=2)
+    uneven = {'delay': '3:11', 'score_missing': 0.2}
+    settings = tiny(overlap=True, record_relabels='all', evaluate_every=0, envs=2, **uneven)
     folder = tmp_path_factory.mktemp('recorded') / 'run'
     with domain():
         summary, _ = train(settings, folder)

@@ -60,6 +60,18 @@ def test_ranges_and_choices_come_from_the_configuration():
     assert '0: not given' in parameters.descriptor('r_max').additional_constraints
 
 
+@pytest.mark.parametrize('delay', ['10:50', 'episode'])
+def test_a_delay_that_is_no_number_is_a_parameter_of_text(make_node, delay):
+    settings = parameters.own_settings(make_node(delay=delay), 'quick')
+    assert settings.delay == delay
+    node = make_node()
+    parameters.declare_settings(node, settings)
+    assert node.get_parameter('delay').value == delay
+    parameters.check_against_run(make_node(delay=delay), settings, 'learner /r/learner')
+    with pytest.raises(parameters.ParameterError, match=f'/r/learner has delay = {delay!r}'):
+        parameters.check_against_run(make_node(delay=25), settings, 'learner /r/learner')
+
+
 def test_an_unknown_parameter_is_refused_with_its_name_and_value(make_node):
     with pytest.raises(
         parameters.ParameterError,
