@@ -157,6 +157,7 @@ def test_evidence_labels_steps_without_a_score_by_the_regression_alone(composite
         stars = np.digitize(values, np.nanquantile(values, [0.25, 0.5, 0.75])) + 1.0
         values[~missing] = stars[~missing]
     made = trained('evidence', memory, composite=composite, evidence__score_scale=scale)
+    assert {type(fact) for fact in made.report().values()} <= {str, float, list}, 'goes into JSON'
     every = memory.segments.all_ids()
     batch = memory.segments.batch(every)
     labels = made.label(batch)

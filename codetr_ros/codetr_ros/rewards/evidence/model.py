@@ -137,10 +137,9 @@ class Model:
             if turn < turns - 1:
                 verdicts = verdicts.learnt(scores, mean, variance)
                 expected = verdicts.expected(scores, mean, variance)[0]
-                factor = (
-                    levels.std() / (expected.std() or 1.0) if len(verdicts.values) > 1 else 1.0
-                )
-                shift = levels.mean() - factor * expected.mean()
+                several = len(verdicts.values) > 1
+                factor = float(levels.std() / (expected.std() or 1.0)) if several else 1.0
+                shift = float(levels.mean() - factor * expected.mean())
                 verdicts = verdicts.moved(factor, shift)
                 mean, variance = mean * factor + shift, variance * factor**2
         self.verdicts = verdicts

@@ -117,7 +117,7 @@ class Verdicts:
         begin = np.concatenate([[self.thresholds[0] / unit], steps, [np.log(self.tau / unit)]])
         best = minimize(loss, begin, method='L-BFGS-B', options={'maxiter': 30})
         thresholds, tau = scale(np.asarray(best.x, np.float64))
-        return Verdicts(self.values, thresholds, tau, float(variance.mean()))
+        return Verdicts(self.values, thresholds, float(tau), float(variance.mean()))
 
     def log_likelihood(self, scores: F64, mean: F64, variance: F64) -> float:
         """Of verdicts (S,), their levels distributed as stated."""
