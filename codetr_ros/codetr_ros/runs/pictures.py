@@ -86,7 +86,7 @@ def segment(one: Segment) -> bytes:
         score = 'score not known' if one.value is None else f'score {exact(one.value, 4)}'
         predicted = '' if one.predicted is None else f', predicted {exact(one.predicted, 4)}'
         axes.set_title(f'{one.source}, episode {one.episode}: {score}{predicted}', fontsize=9)
-        axes.xaxis.get_major_locator().set_params(integer=True)
+        axes.xaxis.get_major_locator().set_params(integer=True, min_n_ticks=1)
         axes.set_xlabel('step of the episode', fontsize=8)
         axes.set_ylabel('step reward', fontsize=8)
         plain(axes)
