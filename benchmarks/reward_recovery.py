@@ -112,12 +112,14 @@ COLUMNS = (
 )
 
 
-def replay(cache: Path, steps: int = 20_000) -> dict[str, np.ndarray]:
+def replay(
+    cache: Path, steps: int = 20_000, task: str = 'HalfCheetah-v5'
+) -> dict[str, np.ndarray]:
     """The true-reward run's steps, made once and kept in `cache`."""
     if not cache.is_file():
         settings = load('quick').changed(
             {
-                'task': 'HalfCheetah-v5',
+                'task': task,
                 'method': 'true',
                 'steps': steps,
                 'warmup_steps': 1000,
