@@ -1,4 +1,4 @@
-"""What does redistribution buy? Every reward method on the default task, five seeds each.
+"""What does credit buy? Every way to share scores out on the default task, ten seeds each.
 
     .venv/bin/python benchmarks/default_task.py
 
@@ -7,21 +7,21 @@ makes the runs that are still missing, then the table and the picture. With the 
 unless `--over-topics` is given. It leaves one JSON file in `<out>/runs/`; runs with a file there
 are not made again.
 
-The methods: `codetr`; `none` (the composite reward goes to its segment's last step, as an agent
-without redistribution sees it); `uniform` (each step of a segment gets an equal share); `true`
-(the environment's own rewards, which no other method sees) and `ones` (a constant 1); and the
-uniformly random policy, which each run evaluates once. On the default task, where staying upright
-is everything, `ones` shows how little credit assignment it needs.
+The variants: `codetr` as shipped; `evidence` alone; `codetr_alone`, the transformer without the
+regression below it; `codetr_paper`, the same with all settings of group `codetr` as the paper has
+them (its network is sixteen times as wide: five seeds); `none` (the composite reward goes to its
+segment's last step, as an agent without redistribution sees it); `uniform` (each step of a
+segment gets an equal share); `true` (the environment's own rewards, which no other method sees);
+and the uniformly random policy, which each run evaluates once.
 
-The table gives for each method, over seeds: mean, sample standard deviation, lowest and highest
+The table gives for each of them, over seeds: mean, sample standard deviation, lowest and highest
 of the last evaluation's true return and score (1 is an agent that earns the task's largest reward
-at every step), and the step of the first evaluation whose true return is at least 90 % of
-`--best`, for each seed, with the distance between evaluations as its resolution.
+at every step).
 
 Another task, composite reward or length goes into another folder:
 
-    .venv/bin/python benchmarks/default_task.py --task Reacher-v5 --delay 10 --steps 8000 \\
-        --out benchmarks/results/reacher
+    .venv/bin/python benchmarks/default_task.py --task Pusher-v5 --delay 100 --steps 15000 \\
+        --out benchmarks/results/pusher
 """
 
 import argparse
@@ -43,24 +43,38 @@ from codetr_ros.config import IN_PROCESS_ONLY, Settings, SettingsError, load
 
 RESULTS = Path(__file__).parent / 'results' / 'default_task'
 METHODS = {
-    'codetr': 'CoDeTr',
+    'codetr': 'CoDeTr as shipped (above evidence)',
+    'evidence': 'evidence',
     'true': 'true rewards (oracle)',
-    'uniform': 'uniform share',
-    'ones': 'constant 1',
-    'none': 'none: composite reward only',
+    'uniform': 'even spread',
+    'codetr_alone': 'CoDeTr alone',
+    'codetr_paper': 'CoDeTr alone, as the paper has it',
+    'none': 'raw scores',
 }
 RANDOM = 'random'
 STYLES = {  # colour (Okabe and Ito: safe for the colour-blind), marker, line
     'codetr': ('#D55E00', 'o', '-'),
+    'evidence': ('#009E73', 'v', '-'),
     'true': ('#000000', 's', '-.'),
     'uniform': ('#0072B2', '^', '-'),
-    'ones': ('#009E73', 'v', '-'),
+    'codetr_alone': ('#E69F00', 'P', '-'),
+    'codetr_paper': ('#56B4E9', 'X', '-'),
     'none': ('#CC79A7', 'D', '-'),
 }
-SEEDS = (0, 1, 2, 3, 4)
-BEST = {'InvertedDoublePendulum-v5': 9360.0}  # the largest return of an episode
-REACHED = 0.9
+SEEDS = tuple(range(10))
+FEWER = {'codetr_paper': 5}
+"""Seeds of what takes long."""
 MEASURES = {'true return': 'final_true_return', 'score': 'final_score'}
+
+
+def variant(name: str) -> dict[str, Any]:
+    """The settings that make it, beyond the preset's."""
+    if name == 'codetr_alone':
+        return {'method': 'codetr', 'codetr.base': 'none'}
+    if name == 'codetr_paper':
+        own = load('paper').model_dump()['codetr']
+        return {'method': 'codetr', **{f'codetr.{key}': value for key, value in own.items()}}
+    return {'method': name}
 
 
 class ResultsError(ValueError):
@@ -106,10 +120,11 @@ def run_one(
         summary = json.loads((out / 'summary.json').read_text())
     if summary['settings_hash'] != settings.hash():
         raise RuntimeError(f'codetr {" ".join(words)} ran with other settings than the given ones')
-    keys = ('method', 'seed', 'in_process', 'evaluations', 'random', 'final_true_return')
+    keys = ('seed', 'in_process', 'evaluations', 'random', 'final_true_return')
     keys += ('final_score', 'wall_s', 'steps', 'lost', 'refused', 'updates', 'gradient_steps')
     keys += ('policy_sha256', 'versions', 'settings_hash', 'settings')
     result = {
+        'variant': path.stem.rpartition('-')[0],
         'command': f'codetr {" ".join(words)}',
         'commit': measured,
         **{key: summary[key] for key in keys},
@@ -130,11 +145,13 @@ def run(arguments: argparse.Namespace) -> int:
     jobs: list[tuple[Settings, list[str], Path]] = []
     for seed in arguments.seeds:
         for method in arguments.methods:
-            given = {**changes, 'method': method, 'seed': seed}
+            if seed >= FEWER.get(method, len(arguments.seeds)):
+                continue
+            given = {**changes, **variant(method), 'seed': seed}
             settings = base.changed(given, 'command line')
             flags = ['--config', arguments.config]
             for name, value in given.items():
-                flags += [f'--{name}', str(value)]
+                flags += _flag(name, value)
             path = folder / f'{method}-{seed}.json'
             if not path.exists():
                 jobs.append((settings, flags, path))
@@ -167,6 +184,13 @@ def run(arguments: argparse.Namespace) -> int:
     return good.count(False)
 
 
+def _flag(name: str, value: Any) -> list[str]:
+    flag = f'--{name.replace("_", "-")}'
+    if isinstance(value, bool):
+        return [flag if value else f'--{name.rpartition(".")[0]}.no-{flag.rpartition(".")[2]}']
+    return [flag, str(value)]
+
+
 def read_runs(out: Path) -> list[dict[str, Any]]:
     """All runs of a folder, by method and seed.
 
@@ -180,7 +204,7 @@ def read_runs(out: Path) -> list[dict[str, Any]]:
     for path, one in zip(paths, runs, strict=True):
         for key, value in one['settings'].items():
             other = runs[0]['settings'][key]
-            if key not in ('method', 'seed') and value != other:
+            if key not in ('method', 'seed', 'codetr') and value != other:
                 raise ResultsError(
                     f'{path} has {key} = {value}, {paths[0]} has {other}: results of different '
                     'settings belong in different folders (--out)'
@@ -191,14 +215,14 @@ def read_runs(out: Path) -> list[dict[str, Any]]:
                 'them in different folders (--out)'
             )
     order = list(METHODS)
-    return sorted(runs, key=lambda one: (order.index(one['method']), one['seed']))
+    return sorted(runs, key=lambda one: (order.index(one['variant']), one['seed']))
 
 
 def by_method(runs: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """Runs by method, in the order of METHODS."""
+    """Runs by variant, in the order of METHODS."""
     runs_of: dict[str, list[dict[str, Any]]] = {}
     for one in runs:
-        runs_of.setdefault(one['method'], []).append(one)
+        runs_of.setdefault(one['variant'], []).append(one)
     return runs_of
 
 
@@ -216,14 +240,6 @@ def random_of(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
-def reached(one: dict[str, Any], least: float) -> str:
-    """The step of the first evaluation that returned `least` or more, or 'never'."""
-    for evaluation in one['evaluations']:
-        if evaluation['true_return_mean'] >= least:
-            return str(evaluation['step'])
-    return 'never'
-
-
 def spread(values: Sequence[float]) -> dict[str, float | None]:
     """Mean, sample standard deviation (None for a single value), lowest and highest."""
     return {
@@ -234,16 +250,10 @@ def spread(values: Sequence[float]) -> dict[str, float | None]:
     }
 
 
-def best_of(arguments: argparse.Namespace, task: str) -> float | None:
-    """The return that counts as 100 %: the given one, else the task's own if known."""
-    return arguments.best if arguments.best is not None else BEST.get(task)
-
-
 def table(arguments: argparse.Namespace) -> None:
     """Write `table.csv` and `table.md`."""
     runs = read_runs(arguments.out)
     settings = runs[0]['settings']
-    best = best_of(arguments, settings['task'])
     rows: list[dict[str, Any]] = []
     for method, some in [*by_method(runs).items(), (RANDOM, random_of(runs))]:
         if not some:
@@ -254,10 +264,6 @@ def table(arguments: argparse.Namespace) -> None:
                 digits = 1 if measure == 'true return' else 4
                 text = '' if value is None else f'{value:.{digits}f}'
                 row[f'{measure.replace(" ", "_")}_{statistic}'] = text
-        if best is not None:
-            steps = [] if method == RANDOM else [reached(one, REACHED * best) for one in some]
-            row['steps_to_90_percent'] = ' '.join(steps)
-            row['seeds_at_90_percent'] = sum(s != 'never' for s in steps) if steps else ''
         walls = [one['wall_s'] for one in some if 'wall_s' in one]
         row['wall_s_mean'] = f'{statistics.fmean(walls):.1f}' if walls else ''
         row['commits'] = ' '.join(sorted({one['commit'] for one in some if 'commit' in one}))
@@ -274,15 +280,12 @@ def table(arguments: argparse.Namespace) -> None:
         '',
     ]
     head = ['method', 'seeds', 'true return: mean ± sd', 'min ... max', 'score: mean ± sd']
-    head += [f'step at {REACHED:.0%} of {best:g}, by seed'] if best is not None else []
-    lines += [f'| {" | ".join(head)} |', '|---|' + '---:|' * 4 + '---|' * (best is not None)]
+    lines += [f'| {" | ".join(head)} |', '|---|' + '---:|' * 4]
     for row in rows:
         cells = [METHODS.get(row['method'], 'random policy'), str(row['seeds'])]
         cells.append(_with_sd(row, 'true_return'))
         cells.append(f'{row["true_return_min"]} ... {row["true_return_max"]}')
         cells.append(_with_sd(row, 'score'))
-        if best is not None:
-            cells.append(', '.join(row['steps_to_90_percent'].split()))
         lines.append(f'| {" | ".join(cells)} |')
     text = '\n'.join(lines) + '\n'
     (arguments.out / 'table.md').write_text(text)
@@ -371,9 +374,6 @@ def parse(given: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument('--delay', type=int)
     parser.add_argument('--composite')
     parser.add_argument('--steps', type=int)
-    parser.add_argument(
-        '--best', type=float, help='the return that counts as 100 %%; known for the default task'
-    )
     parser.add_argument('--out', type=Path, default=RESULTS)
     arguments = parser.parse_args(given)
     if arguments.workers < 1:

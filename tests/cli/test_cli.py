@@ -23,6 +23,9 @@ from codetr_ros.runs import run_summary, segments
 from helpers.executables import prefix
 
 SMALL = {
+    'task': 'InvertedDoublePendulum-v5',
+    'delay': 25,
+    'codetr.base': 'none',
     'steps': 250,
     'phase-steps': 100,
     'warmup-steps': 100,

@@ -231,16 +231,11 @@ def test_nothing_is_evaluated_where_it_is_switched_off() -> None:
     assert not any(s.evaluated(v) for v in range(-1, s.phases))
 
 
-def test_evaluations_of_the_quick_preset_come_every_3000_steps() -> None:
+def test_evaluations_of_the_quick_preset_come_every_1000_steps() -> None:
     s = config.load('quick')
 
-    assert [s.steps_after(v) for v in range(s.phases) if s.evaluated(v)] == [
-        3000,
-        6000,
-        9000,
-        12_000,
-        15_000,
-    ]
+    evaluated = [s.steps_after(v) for v in range(s.phases) if s.evaluated(v)]
+    assert evaluated == list(range(1000, 8001, 1000))
 
 
 def test_the_sources_of_a_run_are_the_environments_of_its_simulators() -> None:

@@ -23,6 +23,7 @@ OBSERVATION, ACTION = 3, 2
 def tiny(**changes: Any) -> Settings:
     """Settings of a run that takes seconds: `codetr__layers=2` sets codetr.layers."""
     small = {
+        'task': 'InvertedDoublePendulum-v5',
         'steps': 1200,
         'phase_steps': 200,
         'warmup_steps': 400,
@@ -33,6 +34,7 @@ def tiny(**changes: Any) -> Settings:
         'sac.hidden': (16, 16),
         'sac.batch': 16,
         'sac.burst': 30,
+        'codetr.base': 'none',
         'codetr.layers': 1,
         'codetr.heads': 2,
         'codetr.embedding': 16,

@@ -98,7 +98,7 @@ def test_settings_that_differ_from_the_nearest_preset_are_shown_and_all_others_f
 
     shown, _, folded = page.partition('<details>')
     assert 'differ from the preset quick' in shown
-    assert '<tr><td>steps</td><td>15000</td><td>2500</td></tr>' in shown
+    assert '<tr><td>steps</td><td>8000</td><td>2500</td></tr>' in shown
     assert '<tr><td>evaluate_episodes</td><td>10</td><td>2</td></tr>' in shown
     assert 'codetr.learning_rate' not in shown
     assert '<tr><td>codetr.learning_rate</td><td>0.001</td></tr>' in folded

@@ -23,9 +23,9 @@ def test_a_summary_says_what_was_run_and_what_came_out() -> None:
 
     for key, value in {
         'run_id': 'r',
-        'task': 'InvertedDoublePendulum-v5',
+        'task': 'Reacher-v5',
         'composite': 'sum',
-        'delay': 25,
+        'delay': 50,
         'method': 'codetr',
         'seed': 0,
         'steps': 2500,
