@@ -6,8 +6,8 @@ rhat_t(steps up to t) by regression (Eq. 4), and SAC learns from w_t rhat_t as s
 Algorithm 1, at the end of the file. `.venv/bin/python examples/codetr_single_file.py` ends with
 the same weights, bit for bit, and prints the same digests as the summary.json of the library by
 
-    codetr train --in-process --config quick --task Reacher-v5 --steps 3000 \
-        --evaluate-every 0 --codetr.tokens pair
+    codetr train --in-process --config quick --delay 25 --steps 3000 \
+        --evaluate-every 0 --codetr.base none --codetr.tokens pair
 
 on the same machine. Left out is what does not change the weights (nodes, checkpoints, evaluation)
 and what is not used with these settings: dropout, eviction from a full memory and, since no
@@ -27,7 +27,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-# Settings: those of `quick`, and in brackets the paper's, where it has others.
+# Settings: those of this command, and in brackets the paper's, where it has others.
 TASK, HORIZON = 'Reacher-v5', 50  # its actions lie in [-1, 1] [Ant-v2, 1000]
 COMPOSITE, DELAY = 'sum', 25  # R_co, one of COMPOSITES; n, a divisor of HORIZON and PHASE
 SEED, STEPS, WARMUP, PHASE = 0, 3000, 1000, 1000  # steps: all, random, of a phase [1M, 10k, 1k]

@@ -162,6 +162,15 @@ def test_on_a_lopsided_scale_credit_is_better_than_with_stars_taken_for_numbers(
     assert np.mean(within['ordinal']) > np.mean(within['numbers']) + 0.02
 
 
+def test_where_the_run_has_levels_scores_are_verdicts_unless_settings_state_otherwise():
+    data = stars('sum', LOPSIDED, segments=40)
+    auto = fitted(data, score_levels=5, **{'evidence.score_scale': 'auto'})
+    assert 'thresholds' in auto.report()
+    for changes in ({'score_levels': 0}, {'score_levels': 5, 'evidence.score_scale': 'numbers'}):
+        made = fitted(data, **{'evidence.score_scale': 'auto', **changes})
+        assert 'thresholds' not in made.report()
+
+
 def test_predicted_verdicts_agree_with_those_given():
     data = stars('sum', np.array([-2.0, 0.0, 2.0]), segments=200)
     made = fitted(data)

@@ -279,10 +279,11 @@ class EvidenceSettings(Group):
         description='how step rewards make a score: as `composite` and `beta` state, or as the '
         'scores themselves let infer',
     )
-    score_scale: Literal['numbers', 'ordinal'] = Field(
-        'numbers',
+    score_scale: Literal['auto', 'numbers', 'ordinal'] = Field(
+        'auto',
         description='whether scores are numbers, or verdicts such as one to five stars of which '
-        'only the order means anything: their scale is then learnt too',
+        'only the order means anything: their scale is then learnt too; auto: ordinal where '
+        '`score_levels` are set',
     )
     scores: int = Field(
         8192,

@@ -86,7 +86,8 @@ class Evidence(Predictor):
 
     @property
     def _ordinal(self) -> bool:
-        return self._own.score_scale == 'ordinal'
+        asked = self._own.score_scale
+        return asked == 'ordinal' or (asked == 'auto' and self._settings.score_levels > 0)
 
     @property
     def version(self) -> int:
