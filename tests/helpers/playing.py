@@ -18,7 +18,8 @@ MODULES = {
     'learner': 'learner_node.learner',
     'reward': 'reward_node.reward',
     'deaf': 'helpers.deaf',
-    'slow': 'helpers.slow_import',
+    'imports': 'helpers.slow_import',
+    'compiles': 'helpers.slow_import:compiling',
 }
 NAMESPACE = '/r'
 PATIENCE = 60.0  # discovery and imports on a busy machine
@@ -31,7 +32,8 @@ def process(role: str, *parameters: str, name: str | None = None):
     command += ['-r', f'__node:={name}'] if name else []
     for parameter in parameters:
         command += ['-p', parameter]
-    node = Forked(command, os.environ, function=f'{MODULES[role]}:main')
+    module, _, function = MODULES[role].partition(':')
+    node = Forked(command, os.environ, function=f'{module}:{function or "main"}')
     try:
         yield node
     finally:

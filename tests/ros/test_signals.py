@@ -1,6 +1,7 @@
 """A signal ends a node at any moment of its process, also while it imports."""
 
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -40,13 +41,11 @@ def test_a_node_that_imports_what_makes_it_a_node_ends_at_once(tmp_path, number)
 
 
 @SIGNALS
-def test_a_node_that_imports_its_part_of_the_run_takes_leave_and_ends(play, tmp_path, number):
-    play = play(roles=('learner',))
-    with process('slow', f'folder:={tmp_path}') as node:
-        play.until(lambda: any(p.run_id for p in play.presence_of('reward')), node)
-        for line in node.stdout:
-            if line == 'imports\n':
-                break
+@pytest.mark.parametrize('what', ['imports', 'compiles'])
+def test_a_node_that_imports_or_compiles_takes_leave_and_ends(play, tmp_path, number, what):
+    play = play(roles=('learner', 'sim', 'record'))
+    with process(what, f'folder:={tmp_path}') as node:
+        play.until(lambda: 'imports' in read(node), node)
         began = time.monotonic()
         node.send_signal(number)
         said = output(node)
@@ -59,13 +58,20 @@ def test_a_node_that_imports_its_part_of_the_run_takes_leave_and_ends(play, tmp_
     assert (tmp_path / 'nodes' / 'reward-reward.json').is_file()
 
 
+def read(node):
+    """What the node has printed by now, without waiting for more."""
+    if select.select([node.stdout], [], [], 0)[0]:
+        return os.read(node.stdout.fileno(), 1 << 16).decode()
+    return ''
+
+
 def test_a_signal_that_an_import_has_caught_is_not_forgotten():
     stop = Stop().install()
     try:
-        with pytest.raises(Stopped), stop.importing(), suppress(BaseException):  # as some do
+        with pytest.raises(Stopped), stop.cutting_short(), suppress(BaseException):  # as some do
             os.kill(os.getpid(), signal.SIGTERM)
         assert stop.signal is signal.SIGTERM
-        with pytest.raises(Stopped), stop.importing():
+        with pytest.raises(Stopped), stop.cutting_short():
             raise AssertionError('not entered')
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -150,7 +150,7 @@ def join(
         link.advertise(['run'], settings)
         link.publish(run)
     try:
-        with member.stop.importing():
+        with member.stop.cutting_short():
             make_core = load_core()
     except Stopped:
         return None

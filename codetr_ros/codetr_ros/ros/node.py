@@ -18,7 +18,7 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import rclpy
@@ -31,7 +31,7 @@ from codetr_ros.ros.gathering import IDLE, wait_for
 from codetr_ros.ros.joining import Joined, LoadCore
 from codetr_ros.ros.membership import Membership
 from codetr_ros.ros.patience import Patience
-from codetr_ros.ros.signals import Stop
+from codetr_ros.ros.signals import Stop, Stopped
 from codetr_ros.ros.wiring import Wire, Wiring
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import reports
@@ -99,16 +99,20 @@ class Node:
         work = core.work()
         patience = Patience(member, [TOPICS[kind] for kind in core.subscribes])
         waiting: float | None = None  # since when
+        worked = False  # the core has yielded something
         while not member.stop:
             member.turn()
             self._sound = False  # until the slice has ended well
-            given = next(work)
+            try:
+                given = self._slice(work, worked)
+            except Stopped:
+                return
             for each in given or ():
                 wiring.deliver(each)
             self._sound = True
             wiring.show(given or (), member.doing)
             if given is not None:
-                waiting = None
+                worked, waiting = True, None
                 member.doing = 'works'
                 continue
             now = time.monotonic()
@@ -121,6 +125,18 @@ class Node:
                 member.doing = wiring.waits()
                 patience.check(now, now - waiting, member.doing, member.traffic.lost())
             member.turn(IDLE)
+
+    def _slice(self, work: Iterator[Any], worked: bool) -> Any:
+        """One slice of a core. Before the core has yielded anything, a signal cuts it short: it
+        may compile for half a minute, and there is nothing to be saved yet.
+
+        Raises:
+            Stopped: a signal did.
+        """
+        if worked:
+            return next(work)
+        with self.member.stop.cutting_short():
+            return next(work)
 
     def _end(self, wiring: Wiring | None, error: str | None) -> int:
         """Save, report, take leave; returns the exit code."""

@@ -7,7 +7,8 @@ nothing.
 
 Imports take seconds, in which nothing checks a flag, and `ros2 launch` kills a process that has
 not ended ten seconds after its first signal. So a signal ends the process at once while it still
-imports what makes it a node, and later cuts an import short by an exception.
+imports what makes it a node, and later cuts an import, or a first slice that compiles, short by an
+exception.
 """
 
 import faulthandler
@@ -23,7 +24,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Stopped(BaseException):
-    """A signal has cut an import short. No error, so that nothing which is imported catches it."""
+    """A signal has cut something short. No error, so that nothing which is imported catches it."""
 
 
 class Stop:
@@ -31,8 +32,8 @@ class Stop:
 
     Attributes:
         signal: the first signal; None before.
-        cut_short: whether an import was cut short: what was imported may be in halves, and the
-            process must end without the interpreter's own end.
+        cut_short: whether something was: what was imported may be in halves, and the process must
+            end without the interpreter's own end.
     """
 
     def __init__(self) -> None:
@@ -74,7 +75,7 @@ class Stop:
         self._starting = False
 
     @contextmanager
-    def importing(self) -> Iterator[None]:
+    def cutting_short(self) -> Iterator[None]:
         """Let a signal cut short what runs inside.
 
         Raises:
