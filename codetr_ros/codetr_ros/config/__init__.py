@@ -11,6 +11,7 @@ from codetr_ros.config.base import (
     names,
     validate,
 )
+from codetr_ros.config.choices import IN_PROCESS_ONLY, SCORE_LEARNERS, Composite, Method
 from codetr_ros.config.delays import Delay, Lengths, delay_in_words
 from codetr_ros.config.loading import (
     PRESETS,
@@ -34,7 +35,7 @@ from codetr_ros.config.methods import (
     RrdSettings,
     SacSettings,
 )
-from codetr_ros.config.run import IN_PROCESS_ONLY, SCORE_LEARNERS, Composite, Method, Settings
+from codetr_ros.config.run import Settings
 
 __all__ = [
     'IN_PROCESS_ONLY',

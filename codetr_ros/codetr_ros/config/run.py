@@ -14,6 +14,7 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from codetr_ros.config.base import Group, SettingsError, flatten, in_words, validate
+from codetr_ros.config.choices import SCORE_LEARNERS, Composite, Method
 from codetr_ros.config.delays import Delay, Delayed
 from codetr_ros.config.methods import (
     AggregateSettings,
@@ -35,51 +36,6 @@ from codetr_ros.records import PROTOCOL_VERSION, RunSpec
 _DEVICE = in_words(
     r'^(cpu|cuda(:\d{1,2})?)$', 'cpu, or a GPU: cuda, or cuda and its number, such as cuda:1'
 )
-Composite = Literal[
-    'sum',
-    'sum_square',
-    'square_sum',
-    'max',
-    'max_hard',
-    'max_log_sum_exp',
-    'max_times_n',
-    'minimum',
-    'peak_end',
-]
-
-
-Method = Literal[
-    'codetr',
-    'none',
-    'rbt',
-    'rrd',
-    'ircr',
-    'diaster',
-    'lrr',
-    'mil_lstm',
-    'hc',
-    'lirpg',
-    'mlp',
-    'aggregate',
-    'evidence',
-    'uniform',
-    'random',
-    'true',
-    'ones',
-]
-
-
-IN_PROCESS_ONLY = {
-    'true': 'is a reference that looks at true rewards, which no node may see',
-    'ones': 'is a reference that ignores the scores',
-    'lirpg': 'learns on-policy, each phase from its own steps alone',
-}
-"""Methods that run in process only, and the reason."""
-
-
-SCORE_LEARNERS: tuple[str, ...] = ('hc', 'lirpg')
-"""Methods whose policy learner learns from the composite rewards themselves, without a reward node
-that labels steps."""
 
 
 class Settings(Schedule, Delayed, Group):
