@@ -213,6 +213,46 @@ def test_the_kind_of_score_is_named_from_the_scores_alone(kind):
         assert report['beta'] == pytest.approx(BETA, rel=0.1)
 
 
+@pytest.fixture(scope='module')
+def undecided() -> tuple[Evidence, Trajectories]:
+    """Two links that are about as likely: scores of two steps, which hardly differ from means."""
+    for seed in range(20):
+        data = planted.memory(
+            planted.progress, lambda r: composite('max', r, 0.3, 2), 2, segments=14, seed=seed
+        )
+        made = fitted(data, delay=2, evidence__link='choose')
+        if 'mixed_with' in made.report():
+            return made, data
+    raise AssertionError('no seed was undecided')
+
+
+def test_where_two_links_are_close_labels_are_their_mean_by_probability(undecided):
+    made, data = undecided
+    (share, best), (other, second) = made._mixture
+    assert share + other == pytest.approx(1) and 0.04 < other <= 0.5
+    assert other / share == pytest.approx(np.exp(second.evidence - best.evidence))
+    batch = everything(made, data)
+    m = batch.lengths - batch.context
+    parts = [
+        part * model.scale * model.labels(made._f(batch, model), batch.values, m)
+        for part, model in ((share, best), (other, second))
+    ]
+    np.testing.assert_allclose(
+        made.label(batch)[segment_steps(batch)], sum(parts) / made.unit, rtol=1e-5
+    )
+    assert made.report()['mixed_with'] == second.link.name
+
+
+def test_a_mixture_is_saved_and_goes_on_to_the_bit(undecided):
+    made, data = undecided
+    again = registry.make(made._settings, O, A)
+    again.load_state(made.state())
+    assert same(again.state(), made.state())
+    assert again.label(everything(made, data)).tobytes() == (
+        made.label(everything(made, data)).tobytes()
+    )
+
+
 # ------------------------------------------------------------------------------------------------
 # phase by phase
 

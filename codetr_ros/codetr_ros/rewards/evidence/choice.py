@@ -33,9 +33,9 @@ class Choice:
     probabilities: dict[str, float]  # of each name, all names alike beforehand
 
     @property
-    def best(self) -> str:
-        """The name of the likeliest."""
-        return max(self.probabilities, key=lambda name: self.models[name].evidence)
+    def order(self) -> list[str]:
+        """The names, the likeliest first."""
+        return sorted(self.models, key=lambda name: -self.models[name].evidence)
 
     @property
     def margin(self) -> float:

@@ -22,6 +22,7 @@ from typing import ClassVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.special import expit
 from torch import Tensor
 
 from codetr_ros.config import Settings
@@ -40,6 +41,10 @@ from codetr_ros.rewards.evidence.uncertainty import deviations
 from codetr_ros.seeding import generator
 from codetr_ros.system.states import check_state
 
+CLOSE = 0.05
+"""Of the likeliest link's probability: from such a share on the next one is mixed in."""
+SECOND = 'second.'
+"""What the names of that one's tensors begin with."""
 SHOWN = 5
 """Features in a summary: those with which the step reward changes most."""
 
@@ -73,6 +78,7 @@ class Evidence(Predictor):
         self._features = Features(observation_size, action_size, settings.seed)
         self._sampler = Sampler(self._features)
         self._model = self._new_model()
+        self._second: Model | None = None  # of the link that is nearly as likely
         self._fits = 0
         self._seen = 0  # digest of the scores of the last fit
         self._begun_at = 0  # scores that there were when a fit was last begun anew; 0: never
@@ -114,7 +120,7 @@ class Evidence(Predictor):
         choosing = anew and self._own.link == 'choose'
         if self._ordinal:
             self._require_few_values(scores)
-        steps = choosing or not self._model.link.linear
+        steps = choosing or not all(model.link.linear for _, model in self._mixture)
         ids = self._ids(memory, all_ids, steps)
         moments = self._sampler.moments(memory, ids)
         if not self._fits or self._features.moments.moved(moments):
@@ -128,7 +134,9 @@ class Evidence(Predictor):
                 self._choose(sample, some)
             else:
                 self._model.measure(scores, memory.segments.lengths(all_ids))
-                self._fit(sample, some, anew)
+                self._model = self._fit(self._model, sample, some, anew)
+                if self._second is not None:
+                    self._second = self._fit(self._second, sample, some, anew)
         except FloatingPointError as error:
             raise RewardModelError(
                 f'method {self.name!r}: the regression on {len(ids)} scores between '
@@ -159,26 +167,35 @@ class Evidence(Predictor):
             most = min(most, max(2, int(self._own.steps / mean)))
         return chosen(ids, most, self._settings.seed)
 
-    def _fit(self, sample: Sample, some: I64, anew: bool) -> None:
+    def _fit(self, before: Model, sample: Sample, some: I64, anew: bool) -> Model:
         """Go on from the last fit, and where `anew` begin anew beside it: the likelier one stays.
 
         Where F is not linear, a fit to few scores may lead to a place that later fits never leave.
         """
-        before = self._model
         fresh = Model(copy.copy(before.link), before.blocks)
         again = anew and before.fitted and not before.link.linear
         before.fit(sample, some, self._ordinal)
         if again:
             fresh.scale = before.scale
             fresh.fit(sample, some, self._ordinal)
-            if fresh.evidence > before.evidence:
-                self._model = fresh
+        return fresh if again and fresh.evidence > before.evidence else before
 
     def _choose(self, sample: Sample, some: I64) -> None:
         choice = choose(sample, some, self._features.blocks, self._ordinal)
-        self._model = choice.models[choice.best]
-        self._probability = choice.probabilities[choice.best]
+        best, second = choice.order[:2]
+        self._model = choice.models[best]
+        close = choice.probabilities[second] > CLOSE * choice.probabilities[best]
+        self._second = choice.models[second] if close else None
+        self._probability = choice.probabilities[best]
         self._margin = choice.margin
+
+    @property
+    def _mixture(self) -> list[tuple[float, Model]]:
+        """The regressions of which labels are made, and the share of each."""
+        if self._second is None:
+            return [(1.0, self._model)]
+        second = float(expit(self._second.evidence - self._model.evidence))
+        return [(1 - second, self._model), (second, self._second)]
 
     # ------------------------------------------------------------------------------------------
     # asking
@@ -192,9 +209,12 @@ class Evidence(Predictor):
         self._require_prepared()
         inside = segment_steps(batch)
         m = batch.lengths - batch.context
-        rewards = self._model.labels(self._f(batch), batch.values, m)
         labels = np.zeros(inside.shape, np.float32)
-        labels[inside] = rewards * (self._model.scale / self.unit)
+        labels[inside] = sum(
+            model.labels(self._f(batch, model), batch.values, m)
+            * (share * model.scale / self.unit)
+            for share, model in self._mixture
+        )
         return labels
 
     def predict(self, batch: SegmentBatch) -> F64:
@@ -204,10 +224,15 @@ class Evidence(Predictor):
             RewardModelError: `prepare` was never called.
         """
         self._require_prepared()
-        return self._model.scores(self._f(batch), batch.lengths - batch.context)
+        m = batch.lengths - batch.context
+        parts = [share * model.scores(self._f(batch, model), m) for share, model in self._mixture]
+        scores: F64 = np.sum(parts, 0)
+        return scores
 
     def uncertainty(self, batch: SegmentBatch) -> Uncertainty:
         """How far the rewards of segments' steps may be off: ask for scores where it is large.
+
+        With two links it is that of the likelier one.
 
         Raises:
             RewardModelError: `prepare` was never called.
@@ -223,7 +248,7 @@ class Evidence(Predictor):
 
     @property
     def model(self) -> Model:
-        """The fitted regression."""
+        """The fitted regression; of two links, that of the likelier one."""
         return self._model
 
     def mean(self, batch: SegmentBatch) -> F64:
@@ -233,11 +258,11 @@ class Evidence(Predictor):
             RewardModelError: `prepare` was never called.
         """
         self._require_prepared()
-        return self._f(batch)
+        return self._f(batch, self._model)
 
-    def _f(self, batch: SegmentBatch) -> F64:
+    def _f(self, batch: SegmentBatch, model: Model) -> F64:
         """The posterior mean (N,) of segments' steps, in units of the level scale."""
-        weights = self._model.posterior.mean
+        weights = model.posterior.mean
         pieces = _steps(batch, segment_steps(batch))
         return np.concatenate([of_steps(self._features(piece), weights) for piece in pieces])
 
@@ -276,6 +301,7 @@ class Evidence(Predictor):
             **(
                 {} if verdicts is None else {'thresholds': (verdicts.thresholds * factor).tolist()}
             ),
+            **({} if self._second is None else {'mixed_with': self._second.link.name}),
             'link_is': 'chosen' if self._own.link == 'choose' else 'known',
             'depends_on': ', '.join(f'{name} {effects[name] * factor:+.2g}' for name in most),
         }
@@ -287,9 +313,14 @@ class Evidence(Predictor):
         """Features, moments, link, scales and posterior, and what has been seen."""
         counts = {'version': self._fits, 'seen': self._seen, 'begun_at': self._begun_at}
         numbers = {'link_probability': self._probability, 'link_margin': self._margin}
+        second: dict[str, Tensor] = {}
+        if self._own.link == 'choose':
+            counts['mixed'] = int(self._second is not None)
+            second = saving.saved(self._second or self._new_model())
         return {
             **super().state(),
             **saving.saved(self._model),
+            **{SECOND + name: tensor for name, tensor in second.items()},
             **{name: torch.tensor(n, dtype=torch.float64) for name, n in numbers.items()},
             **{name: torch.tensor(n, dtype=torch.int64) for name, n in counts.items()},
             'waves': self._features.waves.clone(),
@@ -306,11 +337,16 @@ class Evidence(Predictor):
         """
         settings, features = self._settings, self._features
         check_state(f'reward method {self.name!r}', self.state(), state, RewardModelError)
+        how = (features.blocks, settings.beta, settings.longest)
+        marked = {name: state[name] for name in state if name.startswith(SECOND)}
+        other = {name.removeprefix(SECOND): tensor for name, tensor in marked.items()}
         try:
-            self._model = saving.restored(state, features.blocks, settings.beta, settings.longest)
+            model = saving.restored(state, *how)
+            second = saving.restored(other, *how) if int(state.get('mixed', 0)) else None
         except ValueError as error:
             raise RewardModelError(f'state of method {self.name!r} refused: {error}') from None
         super().load_state(state)
+        self._model, self._second = model, second
         self._fits, self._seen = int(state['version']), int(state['seen'])
         self._begun_at = int(state['begun_at'])
         self._probability = float(state['link_probability'])
