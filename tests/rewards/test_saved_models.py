@@ -100,6 +100,12 @@ def test_a_model_of_other_sizes_settings_or_method_is_refused_naming_both(tmp_pa
         served(checkpoints.latest(tmp_path, 'reward'), phases=0, **changes)
 
 
+def test_an_aggregator_whose_numbers_are_in_units_of_another_delay_is_refused(tmp_path):
+    trained(tmp_path, method='aggregate')
+    with pytest.raises(RewardModelError, match='has delay = 7, here 9'):
+        served(checkpoints.latest(tmp_path, 'reward'), phases=0, method='aggregate', delay=9)
+
+
 def test_how_it_was_trained_may_differ_and_another_task_is_warned_of(tmp_path, caplog):
     trained(tmp_path)
     changes = {'codetr.learning_rate': 0.5, 'codetr.batch': 3, 'seed': 9, 'task': 'Swimmer-v5'}

@@ -13,6 +13,7 @@ import torch
 from codetr_ros.config import Settings, from_canonical
 from codetr_ros.config.delays import LONGEST
 from codetr_ros.rewards import registry
+from codetr_ros.rewards.aggregate import Aggregate
 from codetr_ros.rewards.base import RewardMethod, RewardModelError
 from codetr_ros.rewards.sequence import SequenceMethod
 from codetr_ros.runs import checkpoints
@@ -163,6 +164,6 @@ def _differing(theirs: Settings, ours: Settings) -> list[tuple[str, object, obje
         if group and group in groups and last not in _OF_TRAINING:
             names.append(name)
     differing: list[tuple[str, object, object]] = [(n, saved[n], mine[n]) for n in names]
-    if issubclass(kind, SequenceMethod):
+    if issubclass(kind, (SequenceMethod, Aggregate)):
         differing.insert(len(_SHARED), ('delay', theirs.longest, ours.longest))
     return differing
