@@ -105,7 +105,7 @@ def run_one(
     Raises:
         RuntimeError: the run failed; holds the end of its output.
     """
-    words = ['train', *(['--in-process'] if in_process else []), *flags]
+    words = ['train', '--no-film', *(['--in-process'] if in_process else []), *flags]
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder, 'run')
         command = [sys.executable, '-m', 'codetr_ros.cli', *words, '--out', str(out)]

@@ -196,6 +196,16 @@ def test_fewer_scores_leave_it_less_sure():
     assert steps[1] < 0.7 * steps[0]
 
 
+def test_metrics_state_how_sure_the_newest_steps_and_segments_are():
+    data = told('sum', segments=40)
+    made = fitted(data)
+    batch = everything(made, data)
+    found, metrics = made.uncertainty(batch), made.metrics()
+    assert metrics['step_sd'] == pytest.approx(found.steps[segment_steps(batch)].mean(), rel=1e-5)
+    assert metrics['segment_sd'] == pytest.approx(found.segments.mean(), rel=1e-5)
+    np.testing.assert_array_equal(made.step_deviations(batch), found.steps)
+
+
 # ------------------------------------------------------------------------------------------------
 # a kind of score that is not known
 

@@ -106,7 +106,7 @@ def _shown(
     for i in spread_evenly(memory.segments.scores(ids)):
         stretch, length = loaded.stretches[int(episodes[i])], int(lengths[i])
         batch = memory.segments.batch(ids[i : i + 1], method.context)
-        weights = method.step_weights(batch)
+        weights, deviations = method.step_weights(batch), method.step_deviations(batch)
         shown.append(
             Segment(
                 source=stretch.key.source,
@@ -117,6 +117,9 @@ def _shown(
                 labels=labels[i, :length],
                 true=true[i, :length] if known[i] else None,
                 weights=None if weights is None else weights[0, batch.context[0] :],
+                deviations=None
+                if deviations is None
+                else deviations[0, batch.context[0] :][:length] * method.unit,
             )
         )
     return shown

@@ -145,6 +145,10 @@ class RewardMethod(ABC):
         """
         raise NotImplementedError(f'method {self.name!r} labels whole segments')
 
+    def step_deviations(self, batch: SegmentBatch) -> F32 | None:
+        """How far each label (B, L) may be off, one standard deviation; None if not known."""
+        return None
+
     def step_weights(self, batch: SegmentBatch) -> F32 | None:
         """Weights w (B, L) of the steps in the score; None if the method has none."""
         return None

@@ -99,6 +99,10 @@ def segment(one: Segment) -> bytes:
             axes.patch.set_visible(False)
         dots = 3.5 if len(steps) <= 100 else 0
         axes.plot(steps, one.labels, 'o-', markersize=dots, color=INFERRED, label='inferred')
+        if one.deviations is not None:
+            low, high = one.labels - one.deviations, one.labels + one.deviations
+            name = 'one standard deviation'
+            axes.fill_between(steps, low, high, color=INFERRED, alpha=0.2, lw=0, label=name)
         if one.true is not None:
             axes.plot(steps, one.true, 'o-', markersize=dots, color=TRUE, label='true')
         for each in figure.axes:

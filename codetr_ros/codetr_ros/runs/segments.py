@@ -30,6 +30,7 @@ class Segment:
         true: the environment's own (n,); None if not known.
         predicted: the composite reward that the model predicts; None if it predicts none.
         weights: attention weights w (n,), 1 on average; None if the model has none.
+        deviations: how far each inferred reward (n,) may be off; None if the model cannot tell.
     """
 
     source: str
@@ -40,6 +41,7 @@ class Segment:
     true: F32 | None
     predicted: float | None = None
     weights: F32 | None = None
+    deviations: F32 | F64 | None = None
 
 
 def spread_evenly(values: ArrayLike, count: int = SHOWN) -> list[int]:

@@ -45,6 +45,8 @@ CLOSE = 0.05
 """Of the likeliest link's probability: from such a share on the next one is mixed in."""
 SECOND = 'second.'
 """What the names of that one's tensors begin with."""
+NEWEST, NEWEST_STEPS = 64, 1000
+"""The newest segments, and their steps, of which metrics state how sure the fit is."""
 SHOWN = 5
 """Features in a summary: those with which the step reward changes most."""
 
@@ -84,6 +86,7 @@ class Evidence(Predictor):
         self._begun_at = 0  # scores that there were when a fit was last begun anew; 0: never
         self._probability = 1.0
         self._margin = 0.0
+        self._step_sd = self._segment_sd = 0.0
 
     def _new_model(self) -> Model:
         settings = self._settings
@@ -148,6 +151,17 @@ class Evidence(Predictor):
             self._begun_at = len(all_ids)
         self._seen = seen
         self._fits += 1
+        self._look_back(memory, ids)
+
+    def _look_back(self, memory: Trajectories, ids: I64) -> None:
+        """How sure the fit is of what came last: of a bounded number of steps."""
+        newest = ids[-NEWEST:]
+        ends = np.cumsum(memory.segments.lengths(newest)[::-1])
+        count = max(1, int((ends <= NEWEST_STEPS).sum()))
+        batch = memory.segments.batch(newest[-count:], self.context)
+        found = self.uncertainty(batch)
+        self._step_sd = float(found.steps[segment_steps(batch)].mean())
+        self._segment_sd = float(found.segments.mean())
 
     def _require_few_values(self, scores: F64) -> None:
         values = np.unique(scores)
@@ -246,6 +260,10 @@ class Evidence(Predictor):
         steps[inside] = found.steps * factor
         return Uncertainty(steps, found.segments * factor)
 
+    def step_deviations(self, batch: SegmentBatch) -> F32:
+        """How far each label (B, L) may be off, one standard deviation."""
+        return self.uncertainty(batch).steps
+
     @property
     def model(self) -> Model:
         """The fitted regression; of two links, that of the likelier one."""
@@ -276,6 +294,8 @@ class Evidence(Predictor):
         known = {
             'evidence': model.evidence,
             'left_out_r2': model.left_out_r2,
+            'step_sd': self._step_sd,
+            'segment_sd': self._segment_sd,
             'step_noise_sd': step_noise**0.5 * factor,
             'score_noise_sd': score_noise**0.5 * factor,
             'link': float(links.NAMES.index(model.link.name)),
@@ -313,6 +333,7 @@ class Evidence(Predictor):
         """Features, moments, link, scales and posterior, and what has been seen."""
         counts = {'version': self._fits, 'seen': self._seen, 'begun_at': self._begun_at}
         numbers = {'link_probability': self._probability, 'link_margin': self._margin}
+        numbers |= {'step_sd': self._step_sd, 'segment_sd': self._segment_sd}
         second: dict[str, Tensor] = {}
         if self._own.link == 'choose':
             counts['mixed'] = int(self._second is not None)
@@ -351,6 +372,7 @@ class Evidence(Predictor):
         self._begun_at = int(state['begun_at'])
         self._probability = float(state['link_probability'])
         self._margin = float(state['link_margin'])
+        self._step_sd, self._segment_sd = float(state['step_sd']), float(state['segment_sd'])
         features.waves, features.phases = state['waves'].clone(), state['phases'].clone()
         features.mean, features.std = state['input_mean'].clone(), state['input_std'].clone()
         self._sampler.forget()
