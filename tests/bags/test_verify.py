@@ -334,7 +334,12 @@ def test_an_index_that_is_wrong_is_named_and_hides_nothing(where, said, tmp_path
         ('message_count: 44', 'message_count: 45', 'counts 45 messages, there are 44'),
         ('storage_identifier: mcap', 'storage_identifier: sqlite3', 'the files are sqlite3'),
         ('/run/commits', '/run/other', '3 messages of /run/other'),
-        ('rosbag2_bagfile_information', 'nothing', 'cannot be read'),
+        (
+            'rosbag2_bagfile_information',
+            'nothing',
+            'cannot be read: has no mapping under the key rosbag2_bagfile_information',
+        ),
+        ('version: 9', 'revision: 9', "cannot be read: there is no 'version'"),
     ],
 )
 def test_metadata_that_is_not_so_is_named(old, new, said, tmp_path):

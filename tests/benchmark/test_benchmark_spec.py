@@ -126,7 +126,14 @@ def test_a_spec_that_cannot_be_run_is_refused_by_key_value_and_file(
 
 @pytest.mark.parametrize(
     ('text', 'said'),
-    [('- a\n', 'not list'), ('a: [\n', 'is not YAML'), (None, 'cannot be read: No such file')],
+    [
+        ('- a\n', 'not list'),
+        ('a: [\n', 'is not YAML'),
+        (None, 'cannot be read: No such file'),
+        ("5: 'x'\n", "there is no key 5 .value 'x'."),
+        ('~: 1\ndelay: 2\n', 'there is no key None, delay .value 1.'),
+        ('2026-01-01: 1\n', 'there is no key 2026-01-01 .value 1.'),
+    ],
 )
 def test_a_file_that_holds_no_spec_is_refused(text: str | None, said: str, tmp_path: Path) -> None:
     path = tmp_path / 'spec.yaml'

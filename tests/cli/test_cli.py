@@ -200,6 +200,9 @@ def test_commands_and_their_help_are_listed(capsys: pytest.CaptureFixture[str]) 
         ([], ''),
         (['trian'], "no command 'trian' (did you mean train?)"),
         (['bag', 'recovr'], "no command 'bag recovr' (did you mean recover?)"),
+        (['benchmark', 'reprot'], "no command 'benchmark reprot' (did you mean report?)"),
+        (['--versoin'], "no option '--versoin' (did you mean --version?) in front of a command"),
+        (['--task', 'Hopper-v5'], "no option '--task' in front of a command: commands are train"),
         (['xyz'], "no command 'xyz': commands are"),
     ],
 )

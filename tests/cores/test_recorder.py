@@ -29,9 +29,8 @@ def test_a_phase_is_committed_only_with_all_its_steps_and_all_due_scores():
     r.receive(policy())
     assert commits(r, work) == []
     r.receive(transitions(sequence=1, first_step=199, steps=1, phase_end=True, scores_due=2))
-    assert (
-        commits(r, work) == [] and r.waiting_for() == "phase 0 lacks 2 composite rewards of 'sim'"
-    )
+    assert commits(r, work) == []
+    assert r.waiting_for() == "the rest of phase 0: 2 composite rewards of 'sim'"
     r.receive(score())
     assert commits(r, work) == []
     r.receive(score(sequence=1, first_step=7))
@@ -81,7 +80,8 @@ def test_every_simulator_must_have_ended_its_share():
     work = r.work()
     r.receive(policy(sources=('sim', 'two'), steps=np.array([5, 5], np.uint32)))
     r.receive(transitions(phase_end=True))
-    assert commits(r, work) == [] and r.waiting_for() == "phase 0 lacks 5 of 5 steps of 'two'"
+    assert commits(r, work) == []
+    assert r.waiting_for() == "the rest of phase 0: 5 of 5 steps of 'two'"
     r.receive(transitions(source='two', phase_end=True))
     (made,) = commits(r, work)
     assert made.sources == ('sim', 'two') and made.scorers == ()

@@ -246,6 +246,14 @@ def test_a_peer_that_has_finished_was_there_so_that_a_short_run_is_not_waited_fo
     assert len(peers.absent(settings, 'of another run')) == 4
 
 
+@pytest.mark.parametrize(('settings_hash', 'ending'), [('hash', 'ended'), ('', 'given up')])
+def test_the_log_does_not_call_finished_what_gave_up(settings_hash, ending):
+    peers = Peers('learner')
+    assert peers.note(presence('sim', 'hash', False), 0.0) == 'sim /r/sim is there'
+    last = presence('sim', settings_hash, True)
+    assert peers.note(last, 1.0) == f'sim /r/sim has {ending}'
+
+
 def presence(role, settings_hash, finished):
     return Presence(
         run_id='run',

@@ -11,7 +11,7 @@ from pathlib import Path, PurePath
 from codetr_ros.bags import metadata
 from codetr_ros.bags.errors import BagError, Damage, Place
 from codetr_ros.bags.metadata import METADATA
-from codetr_ros.system.parsing import brief
+from codetr_ros.system.parsing import ParseError
 
 _SPLIT = re.compile(r'_(\d+)\.[a-z0-9.]+$')
 _LFS_POINTER = b'version https://git-lfs'
@@ -47,15 +47,14 @@ def listed_files(folder: Path) -> list[str]:
     path = folder / METADATA
     try:
         _check_no_pointer(path)
-        paths = metadata.read(folder)['relative_file_paths']
-        return [PurePath(name).name for name in paths]
+        return metadata.listed(folder)
     except FileNotFoundError:
         return []
     except OSError as error:
         raise BagError(f'{path} cannot be read: {error.strerror}') from error
-    except (ValueError, LookupError, TypeError) as error:
+    except ParseError as error:
         raise BagError(
-            f'{path} is damaged ({brief(error)}). The messages do not need it: '
+            f'{path} is damaged: it {error}. The messages do not need it: '
             'remove it, or make a new one with `codetr bag recover`'
         ) from error
 

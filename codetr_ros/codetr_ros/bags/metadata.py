@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import yaml
 
 from codetr_ros.bags.names import full_name, full_type_name
-from codetr_ros.system.parsing import read_yaml
+from codetr_ros.system.parsing import ParseError, brief, read_yaml
 
 METADATA = 'metadata.yaml'
 VERSION = 9
@@ -18,15 +18,29 @@ VERSION = 9
 LONGEST = 16 << 20
 """The most bytes of the file."""
 
+_ROOT = 'rosbag2_bagfile_information'
+_FILES = 'relative_file_paths'
+
 
 def read(folder: Path) -> Any:
     """The content of a bag's metadata.
 
     Raises:
         OSError: it cannot be read, or there is none.
-        ParseError, LookupError, TypeError: it is damaged.
+        ParseError: it is damaged.
     """
-    return read_yaml(folder / METADATA, LONGEST, unique=False)['rosbag2_bagfile_information']
+    content = read_yaml(folder / METADATA, LONGEST, unique=False)
+    if not isinstance(content, Mapping) or not isinstance(content.get(_ROOT), Mapping):
+        raise ParseError(f'has no mapping under the key {_ROOT}')
+    return content[_ROOT]
+
+
+def listed(folder: Path) -> list[str]:
+    """Names of the files that a bag's metadata lists; the errors are those of `read`."""
+    paths = read(folder).get(_FILES)
+    if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
+        raise ParseError(f'has no list of names under {_ROOT}.{_FILES}')
+    return [PurePath(path).name for path in paths]
 
 
 class DescribedTopic(Protocol):
@@ -104,7 +118,7 @@ def render(files: Sequence[BagFile], topics: Iterable[DescribedTopic]) -> str:
         ],
         'compression_format': '',
         'compression_mode': '',
-        'relative_file_paths': [file.name for file in files],
+        _FILES: [file.name for file in files],
         'files': [
             {
                 'path': file.name,
@@ -117,7 +131,7 @@ def render(files: Sequence[BagFile], topics: Iterable[DescribedTopic]) -> str:
         'custom_data': None,
         'ros_distro': os.environ.get('ROS_DISTRO', 'jazzy'),
     }
-    return yaml.safe_dump({'rosbag2_bagfile_information': information}, sort_keys=False)
+    return yaml.safe_dump({_ROOT: information}, sort_keys=False)
 
 
 def check(
@@ -140,7 +154,7 @@ def check(
     try:
         yield from _contradictions(read(folder), topics, files)
     except (OSError, LookupError, TypeError, ValueError, AttributeError) as error:
-        yield f'{METADATA} cannot be read: {str(error) or type(error).__name__}'
+        yield f'{METADATA} cannot be read: {brief(error)}'
 
 
 def _contradictions(
@@ -153,7 +167,7 @@ def _contradictions(
     storage = {'mcap': '.mcap', 'sqlite3': '.db3'}.get(content['storage_identifier'])
     if not storage or not all(storage in name for name in files):
         yield f'{METADATA} states that the files are {content["storage_identifier"]}'
-    listed = [PurePath(name).name for name in content['relative_file_paths']]
+    listed = [PurePath(name).name for name in content[_FILES]]
     for name in files.keys() - set(listed):
         yield f'{METADATA} does not list {name}'
     total = sum(files.values())

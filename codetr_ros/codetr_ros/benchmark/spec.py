@@ -131,11 +131,13 @@ def load(path: Path) -> Spec:
             f'spec {path} must hold a mapping with the keys {", ".join(_Keys.model_fields)}, '
             f'not {type(data).__name__}'
         )
-    if unknown := [str(key) for key in data if key not in _Keys.model_fields]:
+    known = _Keys.model_fields
+    if unknown := {str(key): value for key, value in data.items() if key not in known}:
+        first = next(iter(unknown))
         raise BenchmarkError(
-            f'spec {path}: there is no key {", ".join(unknown)} (value {data[unknown[0]]!r})'
-            f'{did_you_mean(unknown[0], _Keys.model_fields)}. '
-            f'Keys are: {", ".join(_Keys.model_fields)}; settings go under config'
+            f'spec {path}: there is no key {", ".join(unknown)} (value {unknown[first]!r})'
+            f'{did_you_mean(first, known)}. '
+            f'Keys are: {", ".join(known)}; settings go under config'
         )
     try:
         keys = _Keys.model_validate(dict(data))

@@ -124,6 +124,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f'codetr {version_of("codetr_ros") or "of unknown version: it is not installed"}')
         return 0
     command = COMMANDS.get(given[0])
+    if command is None and given[0].startswith('-'):
+        from codetr_ros.system.similar import did_you_mean
+
+        close = did_you_mean(given[0], ('--help', '--version'))
+        return refuse(
+            f'there is no option {given[0]!r}{close} in front of a command: '
+            f'commands are {", ".join(COMMANDS)}'
+        )
     if command is None:
         return refuse_command(given[0], given[0], COMMANDS)
     try:

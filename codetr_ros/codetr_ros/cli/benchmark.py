@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from codetr_ros.cli import FAILED, INTERRUPTED, refuse
+from codetr_ros.cli import FAILED, INTERRUPTED, refuse, refuse_command
 from codetr_ros.cli.terminal import parse_arguments
 from codetr_ros.config import Settings
 from codetr_ros.processes.supervise import Interrupts
@@ -71,9 +71,12 @@ class Report:
 
 def main(arguments: Sequence[str]) -> int:
     """Carry out the command line; returns the exit code."""
+    known = ('run', 'report')
+    if arguments and not arguments[0].startswith('-') and arguments[0] not in known:
+        return refuse_command(f'benchmark {arguments[0]}', arguments[0], known)
     kinds: Any = (
-        Annotated[Run, tyro.conf.subcommand('run')]
-        | Annotated[Report, tyro.conf.subcommand('report')]
+        Annotated[Run, tyro.conf.subcommand(known[0])]
+        | Annotated[Report, tyro.conf.subcommand(known[1])]
     )
     given: Run | Report = parse_arguments(
         kinds,

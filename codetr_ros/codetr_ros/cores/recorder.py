@@ -152,7 +152,7 @@ class Recorder(Part):
         )
 
     def waiting_for(self) -> str:
-        """What the next phase still lacks, for people."""
+        """What the recorder waits for, for people: what the next phase still lacks."""
         members = self._permitted.get(self.phase)
         if not members:
             return f'permission for phase {self.phase} from the learner'
@@ -169,7 +169,7 @@ class Recorder(Part):
                 )
                 if due > 0:
                     lacks.append(f'{due} composite rewards of {source!r}')
-        return f'phase {self.phase} lacks ' + (', '.join(lacks) or 'nothing')
+        return f'the rest of phase {self.phase}' + (f': {", ".join(lacks)}' if lacks else '')
 
     def close(self) -> None:
         """Nothing to save: the bag belongs to the wiring of this core."""

@@ -56,7 +56,8 @@ class Peers:
             before = [p for p in self.by_instance.values() if p.presence.node == presence.node]
             return f'{who} is there{" again" if len(before) > 1 else ""}'
         if presence.finished and not known.presence.finished:
-            return f'{who} has finished'
+            now_known = self.by_instance[presence.instance_id]
+            return f'{who} has {"given up" if now_known.failed else "ended"}'
         return None
 
     def newest(self) -> list[Peer]:

@@ -146,6 +146,8 @@ def check_values(content: Any) -> None:
 
 def brief(error: Exception) -> str:
     """A message of another library, on one line and not endless."""
+    if isinstance(error, KeyError):
+        return shortened(f'there is no {error}')
     return shortened(' '.join(str(error).split()) or type(error).__name__)
 
 
