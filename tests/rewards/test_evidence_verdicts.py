@@ -153,6 +153,25 @@ def test_credit_is_right_where_scores_are_one_to_five_stars(kind):
     assert facts['verdict_noise_sd'] > 0
 
 
+@pytest.mark.parametrize('seed', range(4))
+def test_fits_of_maxima_to_verdicts_do_not_diverge(seed):
+    data = planted.memory(
+        lambda s, a, after: after[:, 8] - 0.1 * (a * a).sum(1),
+        lambda r: float(np.searchsorted([0.9, 1.2, 1.6, 2.0], composite('max', r, 3.0, 25))),
+        delay=25,
+        segments=120,
+        seed=seed,
+        components=20,
+    )
+    made = registry.make(
+        builders.tiny(**SETTINGS | {'composite': 'max', 'delay': 25, 'seed': seed}), 20, A
+    )
+    assert isinstance(made, Evidence)
+    made.prepare(data)
+    assert planted.within(made, data) > 0.6
+    assert str(made.report()['depends_on']).startswith("s'[8] +")
+
+
 def test_on_a_lopsided_scale_credit_is_better_than_with_stars_taken_for_numbers():
     within = {'ordinal': [], 'numbers': []}
     for seed in range(4):

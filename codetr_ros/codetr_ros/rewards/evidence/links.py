@@ -30,12 +30,22 @@ NAMES = tuple(_MAKE)
 """Links by name: those of the composite rewards, and the mean. Saved models hold their places."""
 
 
-def make(name: str, beta: float, delay: int) -> Link:
+VERDICTS = 4.0
+"""Inverse temperature from which that of a maximum is learnt where scores are verdicts: theirs is
+not known, as they have no unit.
+"""
+
+
+def make(name: str, beta: float, delay: int, ordinal: bool = False) -> Link:
     """A link by its name.
 
     Args:
         name: one of `NAMES`.
         beta: the inverse temperature that scores are made with, in the task's unit.
         delay: n, the steps of a whole segment.
+        ordinal: only the order of scores means anything.
     """
-    return _MAKE[name](beta, delay)
+    link = _MAKE[name](VERDICTS if ordinal else beta, delay)
+    if ordinal and isinstance(link, SoftMax) and not isinstance(link, MaxLogSumExp):
+        link.learnt = True
+    return link

@@ -90,7 +90,7 @@ class Evidence(Predictor):
 
     def _new_model(self) -> Model:
         settings = self._settings
-        link = links.make(settings.composite, settings.beta, settings.longest)
+        link = links.make(settings.composite, settings.beta, settings.longest, self._ordinal)
         return Model(link, self._features.blocks)
 
     @property

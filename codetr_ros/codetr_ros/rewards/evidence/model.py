@@ -37,8 +37,17 @@ FEW = 200
 """Scores up to which a first fit has several beginnings."""
 HEAT_ROUNDS = 3
 """Rounds with each of them."""
-TURNS = (5, 2)
+TURNS = (7, 2)
 """Of learning levels and the scale of verdicts, in a first fit and in later ones."""
+LEAST_LEFT = (1e-3, 0.2)
+"""Of 1 - leverage, where a verdict is predicted from the others: for links that are linear, and
+for others. A few rounds of Gauss-Newton do not end where that would be exact, and without this and
+the next two bounds such fits diverge.
+"""
+FARTHEST, SUREST = 4.0, 0.05
+"""Deviations of levels: how far from their mean a verdict's level may be, and the least deviation
+that it may have.
+"""
 STEPS = (1.0, 0.5, 0.25)
 """Step lengths of Gauss-Newton, of which the best one is taken."""
 
@@ -181,7 +190,7 @@ class Model:
             data = self._linearised(sample, slopes, targets.levels, targets.noise)
         noises = noise(self.theta, data)
         variances = self.posterior.variances(data.rows)
-        left = (1 - variances / noises).clamp_min_(1e-3)  # 1 - leverage
+        left = (1 - variances / noises).clamp_min_(LEAST_LEFT[not self.link.linear])
         off = targets.levels - self._predicted(sample)
         own = noises - data.noise  # of the level itself, which a verdict is about
         mean: F64 = targets.levels - off / left.numpy()
@@ -338,7 +347,12 @@ class Model:
 
 
 def _sites(verdicts: Verdicts, scores: F64, mean: F64, variance: F64) -> Targets:
+    """What verdicts state of levels, within bounds."""
     levels, left = verdicts.sites(scores, mean, variance)
+    deviation = math.sqrt(float(np.var(mean) + np.mean(variance)))
+    middle, far = float(mean.mean()), FARTHEST * deviation
+    levels = np.clip(levels, middle - far, middle + far)
+    left = np.maximum(left, (SUREST * deviation) ** 2)
     return Targets(levels, torch.tensor(left))
 
 
