@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from codetr_ros.bags.definitions import Definition, parsed
+from codetr_ros.bags.definitions import Definition, parsed, types_of
 from codetr_ros.bags.errors import BagError
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.recover import recover
@@ -95,6 +95,18 @@ def test_an_idl_definition_gives_the_same_fields_as_the_msg_definition(name):
     assert {kind: fields for kind, (_, fields) in by_idl.items()} == {
         kind: fields for kind, (_, fields) in by_msg.items()
     }
+
+
+@pytest.mark.parametrize('encoding', ['ros2idl', 'ros2msg'])
+def test_a_definition_that_cannot_be_read_is_refused_on_one_line(encoding):
+    with pytest.raises(BagError, match='the definition of a/msg/B cannot be read: ') as refused:
+        types_of('a/msg/B', Definition(encoding, 'float64 x\n\n]] y\n'))
+    assert '\n' not in str(refused.value)
+
+
+def test_messages_of_no_type_are_refused():
+    with pytest.raises(BagError, match='does not state of what type its messages are'):
+        types_of('', Definition('', ''))
 
 
 def test_an_idl_definition_may_contain_types_defined_by_msg_files():

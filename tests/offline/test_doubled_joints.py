@@ -72,7 +72,8 @@ def test_convert_prints_the_hint(tmp_path, capsys):
     given = ['convert', str(there), '--mapping', str(tmp_path / 'mapping.json')]
     assert main([*given, '--out', str(tmp_path / 'out')]) == 0
     out = capsys.readouterr().out
-    assert JOINTS_DOUBLED in out.split('dropped')[1]
+    assert JOINTS_DOUBLED in out.split('noted')[1]
+    assert 'dropped     nothing\n' in out
     assert 'two nodes seem to publish the same joints' in out
 
 

@@ -1,11 +1,14 @@
 """Steps and scores are the same whatever the order of the file, and by whichever time is asked."""
 
+import json
+
 import numpy as np
 import pytest
 
 from codetr_ros.bags.errors import BagError
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.verify import verify
+from codetr_ros.cli import main
 from codetr_ros.config import validate
 from codetr_ros.offline import conversion, converted_bag, converting
 from codetr_ros.offline.converted_bag import convert
@@ -47,6 +50,17 @@ def test_a_bag_written_topic_by_topic_gives_the_steps_of_one_in_order(write, tmp
     assert scores == {0: SCORES}
     assert (made.shortest, made.longest) == (0.02, 0.02)
     assert made.dropped == {converted_bag.LATE: 44}
+
+
+def test_what_was_only_put_in_order_is_not_printed_as_dropped(tmp_path, capsys):
+    sent = sorted(attempt(40), key=lambda one: one.topic)
+    there = mcap_file(tmp_path / 'x.mcap', sent)
+    (tmp_path / 'mapping.json').write_text(json.dumps(rules()))  # JSON is YAML
+    given = ['convert', str(there), '--mapping', str(tmp_path / 'mapping.json')]
+    assert main([*given, '--out', str(tmp_path / 'out')]) == 0
+    out = capsys.readouterr().out
+    assert 'dropped     nothing\n' in out
+    assert f'noted       44 {converted_bag.LATE}\n' in out
 
 
 @pytest.mark.parametrize('write', [bag, mcap_file])

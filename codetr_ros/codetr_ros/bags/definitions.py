@@ -31,6 +31,7 @@ from codetr_ros.bags.errors import BagError
 from codetr_ros.bags.names import full_type_name
 from codetr_ros.records import Record, RecordError
 from codetr_ros.records.fields import RECORD_TYPES, record_of, type_name
+from codetr_ros.system.parsing import brief
 
 LONGEST_DEFINITION = 1 << 20
 """The most characters of a definition in a bag, with all that it contains."""
@@ -89,7 +90,7 @@ def parsed(name: str, definition: Definition) -> Typesdict:
     try:
         types = get_types_from_msg(text, name) if encoding == 'ros2msg' else _idl_types(text)
     except (TypesysError, ValueError, LookupError, RecursionError) as error:
-        raise BagError(f'the definition of {name} cannot be read: {error}') from error
+        raise BagError(f'the definition of {name} cannot be read: {brief(error)}') from error
     if name not in types:
         raise BagError(f'the definition of {name} does not define it')
     return types
@@ -231,6 +232,8 @@ def types_of(name: str, definition: Definition) -> Typestore:
     Raises:
         BagError: the type is not known, or its definition cannot be used.
     """
+    if not name:
+        raise BagError('the bag does not state of what type its messages are')
     if not definition.encoding:
         store = get_typestore(Stores.ROS2_JAZZY)
         if name not in store.fielddefs:
@@ -242,5 +245,5 @@ def types_of(name: str, definition: Definition) -> Typestore:
         store.register(types)
         store.get_msgdef(name)
     except UNREADABLE as error:
-        raise BagError(f'the definition of {name} cannot be used: {error}') from error
+        raise BagError(f'the definition of {name} cannot be used: {brief(error)}') from error
     return store

@@ -40,8 +40,9 @@ def main(arguments: Sequence[str]) -> int:
         return refuse(f'--out {given.out}: {error}')
     from codetr_ros.bags.reader import Bag
     from codetr_ros.offline import mapping
-    from codetr_ros.offline.conversion import HINTS
-    from codetr_ros.offline.converted_bag import convert
+    from codetr_ros.offline.conversion import HINTS, JOINTS_DOUBLED
+    from codetr_ros.offline.converted_bag import LATE, OVERLAPS, convert
+    from codetr_ros.offline.converting import CLOCK_BACK
 
     try:
         rules = mapping.load(Path(given.mapping))
@@ -49,7 +50,9 @@ def main(arguments: Sequence[str]) -> int:
     except (BagError, FitError, RecordError, SettingsError) as error:
         return refuse(str(error))
     read = ', '.join(f'{n} of {topic}' for topic, n in sorted(made.messages.items()))
-    lost = ', '.join(f'{n} {what}' for what, n in made.dropped.items())
+    kept = (LATE, OVERLAPS, CLOCK_BACK, JOINTS_DOUBLED)
+    lost = ', '.join(f'{n} {what}' for what, n in made.dropped.items() if what not in kept)
+    noted = ', '.join(f'{n} {what}' for what, n in made.dropped.items() if what in kept)
     each = f'{made.fewest}' if made.fewest == made.most else f'{made.fewest} to {made.most}'
     rows = {
         'messages': read,
@@ -60,6 +63,7 @@ def main(arguments: Sequence[str]) -> int:
         if made.scores
         else 'none',
         'dropped': lost or 'nothing',
+        **({'noted': noted} if noted else {}),
         'output': given.out,
     }
     shown = console()
