@@ -124,25 +124,45 @@ def test_of_a_run_without_a_bag_report_and_picture_are_made_again(folder):
     assert (folder / run_folder.REPORT).stat().st_size
 
 
+def test_the_report_of_a_run_that_was_moved_names_its_bag_where_it_is(folder, tmp_path):
+    path = run_folder.report_path(folder, 'record', 'record')
+    before = NodeReport.model_validate_json(path.read_text())
+    reports.write(path, before.model_copy(update={'bag': '/where/it/was/bag'}))
+
+    assert cli.main(['report', '--no-film', str(folder)]) == 0
+
+    assert summary_of(folder)['bag'] == str(tmp_path / run_folder.BAG)
+    assert '/where/it/was' not in (folder / run_folder.REPORT).read_text()
+
+
 @pytest.mark.parametrize(
     ('what', 'said'),
     [
         ('none', 'there is no folder'),
+        ('other/bag', 'holds neither a bag nor a summary.json'),
+        ('other/bag', 'give the folder of the run, {}/other. Nodes leave'),
+        ('other/bag/metadata.yaml', 'is a file: give the folder of the run, {}/other'),
         ('empty', 'holds neither a bag nor a summary.json'),
+        ('fit', 'is the folder of a fit, whose report is {}/fit/report.html'),
+        ('listed', 'holds list, not an object'),
         ('two', 'holds 2 runs (r, s): give the folder of one run'),
         ('other', 'bag holds no run'),
     ],
 )
 def test_a_folder_without_a_run_is_refused(what, said, tmp_path, capsys):
     (tmp_path / 'empty').mkdir()
+    for name, content in (('fit', {'fit': {'method': 'mlp'}}), ('listed', [])):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / run_folder.SUMMARY).write_text(json.dumps(content))
     both = [run(SETTINGS, 'r'), run(SETTINGS, 's')]
     ours(tmp_path / 'two' / run_folder.BAG, [*both, *a_run()])
     ours(tmp_path / 'other' / run_folder.BAG, a_run())
 
     assert cli.main(['report', str(tmp_path / what)]) == cli.USAGE
 
-    assert said in capsys.readouterr().err
-    assert not (tmp_path / what / run_folder.SUMMARY).exists()
+    assert said.format(tmp_path) in capsys.readouterr().err
+    made = [path.parent.name for path in tmp_path.rglob(run_folder.SUMMARY)]
+    assert sorted(made) == ['fit', 'listed']
 
 
 def test_the_folder_of_a_benchmark_gets_the_report_of_a_benchmark(tmp_path, capsys):

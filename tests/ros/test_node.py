@@ -200,6 +200,14 @@ def test_an_unknown_parameter_stops_the_node_naming_it(ros_domain):
 
 
 @pytest.mark.slow
+def test_a_checkpoint_that_is_not_there_stops_the_node_before_it_waits(ros_domain, tmp_path):
+    with process('reward', f'checkpoint:={tmp_path / "none"}') as node:
+        said = output(node)
+    assert node.returncode == 1
+    assert f"parameter checkpoint = '{tmp_path}/none': there is no such folder" in said
+    assert 'Traceback' not in said
+
+
 def test_another_protocol_version_is_refused(play):
     play = play(roles=('learner',))
     spec = play.spec

@@ -109,7 +109,7 @@ def newest_policy(folder: Path, settings: Settings) -> Policy:
     if path is None:
         raise RunFolderError(
             f'{place} holds no checkpoint of the learner: let the run get past its warm-up '
-            f'({settings.warmup_steps} steps)'
+            f'({settings.warmup_steps} steps). A fit has a reward model, and no policy'
         )
     tensors, meta = checkpoints.load(path)
     phase = checkpoints.phase_of(path)

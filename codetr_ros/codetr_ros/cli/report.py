@@ -20,6 +20,7 @@ from codetr_ros.runs.folder import RunFolderError
 from codetr_ros.runs.reports import NodeReport
 from codetr_ros.runs.run_summary import RunSummary
 from codetr_ros.runs.summary import Summary
+from codetr_ros.system.parsing import ParseError, read_json
 
 OWN = 'codetr'
 """What a summary calls the process of `codetr train`."""
@@ -93,12 +94,39 @@ def look(folder: Path) -> Found:
         RunFolderError: it is no such folder, or a node's report or the summary is damaged.
     """
     if not folder.is_dir():
-        raise RunFolderError(f'there is no folder {folder}: give the folder of a run')
+        what = f'{folder} is a file' if folder.exists() else f'there is no folder {folder}'
+        raise RunFolderError(f'{what}: give {_meant(folder)}')
     known = reports.read_all(folder)
     places = [folder / run_folder.BAG, *(Path(r.bag) for r in known.values() if r.bag)]
     bag = next((place for place in places if place.exists()), None)
     path = folder / run_folder.SUMMARY
+    if bag is None and path.exists():
+        _check_no_fit(path)
     return Found(known, bag, run_summary.read(path) if path.exists() else None)
+
+
+def _check_no_fit(path: Path) -> None:
+    """Refuse the summary of a fit: its report cannot be made again, and is there.
+
+    Raises:
+        RunFolderError: it is one.
+    """
+    try:
+        content = read_json(path)
+    except (OSError, ParseError):
+        return  # whoever reads it in full names what is wrong
+    if isinstance(content, dict) and 'fit' in content:
+        raise RunFolderError(
+            f'{path.parent} is the folder of a fit, whose report is '
+            f'{path.with_name(run_folder.REPORT)}: give the folder of a run'
+        )
+
+
+def _meant(place: Path) -> str:
+    """The folder of the run that a place seems to lie in, for an error."""
+    own = (run_folder.BAG, run_folder.SUMMARY)
+    around = (f for f in list(place.parents)[:2] if any((f / name).exists() for name in own))
+    return next((f'the folder of the run, {folder}' for folder in around), 'the folder of a run')
 
 
 def again(folder: Path, found: Found, draw: bool) -> RunSummary:
@@ -110,8 +138,9 @@ def again(folder: Path, found: Found, draw: bool) -> RunSummary:
     """
     if found.before is None:
         raise RunFolderError(
-            f'{folder} holds neither a bag nor a {run_folder.SUMMARY}, so nothing is known of a '
-            'run: give the folder of a run, to the recorder as its parameter folder too'
+            f'{folder} holds neither a {run_folder.BAG} nor a {run_folder.SUMMARY}, so nothing is '
+            f'known of a run: give {_meant(folder)}. Nodes leave a bag there if the recorder has '
+            'that folder as its parameter `folder`'
         )
     report.write(folder, found.before, film_strip.make(folder) if draw else '')
     return found.before

@@ -106,6 +106,12 @@ class Membership:
         self.link.subscribe(Presence, self.take)
         self.link.subscribe(RunSpec, self.take)
         self._check_folders()
+        checkpoint = self.values.get('checkpoint')
+        if checkpoint and not Path(checkpoint).is_dir():
+            raise NodeError(
+                f'{self.link.full_name}: parameter checkpoint = {checkpoint!r}: there is no such '
+                'folder. Give that of a checkpoint, of a fit or of a run'
+            )
 
     def _check_folders(self) -> None:
         """Refuse a folder in which nothing can be written, now rather than at the end of a phase.

@@ -262,7 +262,8 @@ class Summary:
             lost=sum(row.lost for row in messages.values()),
             duplicated=sum(row.duplicated for row in messages.values()),
             refused=sum(row.refused for row in messages.values()),
-            bag=_first(r.bag for r in of_role('record')) or (str(bag) if bag else None),
+            # where it is now: the folder may have been moved since the recorder wrote it
+            bag=str(bag) if bag else _first(r.bag for r in of_role('record')),
             processes=processes(reports),
             counters={n: r.counters for n, r in sorted(reports.items()) if r.counters},
             versions=modules.version_of_task(settings.task) | versions(),
