@@ -18,7 +18,7 @@ def test_a_shipped_spec_is_valid(path: Path) -> None:
     cells = spec.load(path).cells
 
     assert len(cells) == len({cell.name for cell in cells})
-    assert {cell.settings.seed for cell in cells} == {0, 1, 2}
+    assert {0, 1, 2} <= {cell.settings.seed for cell in cells}, 'three seeds at least'
 
 
 def test_the_papers_spec_has_its_delays_composite_rewards_and_settings() -> None:

@@ -122,10 +122,10 @@ def test_any_other_error_is_told_with_its_kind():
 
 
 class Core(Part):
-    """A core whose second slice fails."""
+    """A core whose third slice fails."""
 
     subscribes = ()
-    signal = None  # comes in the first slice
+    signal = None  # comes in the second slice: one in the first cuts it short, nothing is saved
 
     def __init__(self, error, stop):
         super().__init__()
@@ -134,6 +134,7 @@ class Core(Part):
         self.saved = False
 
     def work(self):
+        yield []
         self.stop.signal = self.signal
         yield []
         raise self.error
