@@ -136,6 +136,17 @@ def test_drawn_lengths_and_whole_episodes_have_rows_of_their_own_after_shorter_o
     assert [row.delays for row in alone] == [(25,), ('10:50',), (50,), ('episode',)]
 
 
+def test_rows_of_the_interquartile_means_state_their_delays(tmp_path: Path) -> None:
+    made = benchmark(tmp_path / 'b', lambda cell: 0.5, delays=['episode', '10:50'])
+    folder, _ = report.write([made.path])
+
+    section = (folder / 'table.md').read_text().partition('Interquartile means')[2]
+    lines = section.partition('\n#')[0].splitlines()
+    rows = [line for line in lines if line.startswith('|')][2:]
+    assert len(set(rows)) == len(rows) > 2
+    assert {row.split('|')[3].strip() for row in rows if '0.5000' in row} >= {'episode', '10:50'}
+
+
 def test_the_interquartile_mean_is_that_of_the_middle_half() -> None:
     values = [9.0, -100.0, 1.0, 2.0, 3.0, 4.0, 1000.0, 5.0]
 

@@ -94,6 +94,13 @@ def test_nodes_that_gave_up_or_were_stopped_are_a_failure_or_an_interruption(fol
     assert cli.main(['report', '--no-film', str(folder)]) == 0
     assert summary_of(folder)['failure'] == 'learner: training has diverged'
 
+    other = run_folder.report_path(folder, 'record', 'record')
+    gone = {'wall_s': 1.0, 'finished': False, 'error': 'sim is silent'}
+    reports.write(other, reports.read(other).model_copy(update=gone))
+    assert cli.main(['report', '--no-film', str(folder)]) == 0
+    said = summary_of(folder)['failure']
+    assert said == 'record: sim is silent; learner: training has diverged', 'the first one first'
+
 
 def test_the_bag_of_a_killed_recorder_is_read_as_far_as_it_goes(folder, capsys):
     file = next((folder / run_folder.BAG).glob('*.mcap'))

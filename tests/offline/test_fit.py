@@ -70,6 +70,7 @@ def test_a_bag_becomes_a_checkpoint_a_summary_and_a_report_without_ros(a_run, tm
         *['a segment'] * 6,
     ]
     assert f'{said["metrics"]["composite_r2"]:.3f} on held-out episodes' in page
+    assert f'correlation with the true ones {said["metrics"]["pearson"]:.3f} (Pearson)' in page
 
     tensors, meta = checkpoints.load(checkpoints.latest(out / 'checkpoints', 'reward'))
     settings = config.from_canonical(meta['settings'], 'checkpoint')

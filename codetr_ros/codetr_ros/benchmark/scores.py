@@ -177,6 +177,7 @@ def interquartile(aggregates: Sequence[Aggregate], together: Sequence[Row]) -> l
                 [
                     row.task,
                     row.composite,
+                    ', '.join(map(str, row.delays)),
                     entry.method,
                     _number(entry.iqm, 4),
                     _interval(entry.interval),
@@ -188,6 +189,7 @@ def interquartile(aggregates: Sequence[Aggregate], together: Sequence[Row]) -> l
             lines.append(
                 [
                     each.task,
+                    'all',
                     'all',
                     each.method,
                     f'{each.iqm:.4f}',
@@ -204,7 +206,7 @@ def interquartile(aggregates: Sequence[Aggregate], together: Sequence[Row]) -> l
             f'of a stratified bootstrap ({REPLICATES} draws; strata are composite reward and '
             'delay, seeds are drawn within). With three seeds such an interval is rough.'
         ),
-        Table(['task', 'composite', 'method', 'IQM', 'interval', 'cells'], lines),
+        Table(['task', 'composite', 'delays', 'method', 'IQM', 'interval', 'cells'], lines),
     ]
 
 

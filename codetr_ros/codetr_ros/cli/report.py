@@ -1,6 +1,7 @@
 """`codetr report`: the summary, report and pictures of a run from what lies in its folder."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -226,8 +227,9 @@ def _kept(built: RunSummary, before: RunSummary | None) -> dict[str, object]:
 
 
 def _failure(reports: Mapping[str, NodeReport]) -> str | None:
-    """Why the nodes gave up; None if none did."""
-    why = [f'{report.name}: {report.error}' for report in reports.values() if report.error]
+    """Why the nodes gave up, the first one first: the others followed it. None if none did."""
+    gone = sorted(reports.values(), key=lambda one: math.inf if one.wall_s is None else one.wall_s)
+    why = [f'{report.name}: {report.error}' for report in gone if report.error]
     return '; '.join(why) or None
 
 

@@ -191,15 +191,17 @@ def rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     metrics = summary['metrics']
     facts.append(('composite R²', _explained(metrics['composite_r2'], summary['judged_on'])))
     known = [
-        (name, f'{metrics[key]:.3f} {summary["judged_on"]}')
+        f'{metrics[key]:.3f} ({name})'
         for name, key in (
             ('Pearson', 'pearson'),
-            ('Pearson within segments', 'within_pearson'),
+            ('Pearson, within segments', 'within_pearson'),
             ('Spearman', 'spearman'),
         )
         if metrics[key] is not None
     ]
-    facts += known or [('step rewards', 'cannot be judged: no true ones are known')]
+    judged = f'correlation with the true ones {", ".join(known)} {summary["judged_on"]}'
+    none = 'cannot be judged: no true ones are known'
+    facts.append(('step rewards', judged if known else none))
     skipped = sum(summary['skipped'].values())
     what = f': {", ".join(f"{n} {name}" for name, n in summary["skipped"].items())}'
     return [
