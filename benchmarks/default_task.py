@@ -40,6 +40,7 @@ from typing import Any
 
 import machine
 from codetr_ros.config import IN_PROCESS_ONLY, Settings, SettingsError, load
+from codetr_ros.runs import references
 
 RESULTS = Path(__file__).parent / 'results' / 'default_task'
 METHODS = {
@@ -264,6 +265,7 @@ def table(arguments: argparse.Namespace) -> None:
                 digits = 1 if measure == 'true return' else 4
                 text = '' if value is None else f'{value:.{digits}f}'
                 row[f'{measure.replace(" ", "_")}_{statistic}'] = text
+        row['true_returns_by_seed'] = ' '.join(f'{one["final_true_return"]:.1f}' for one in some)
         walls = [one['wall_s'] for one in some if 'wall_s' in one]
         row['wall_s_mean'] = f'{statistics.fmean(walls):.1f}' if walls else ''
         row['commits'] = ' '.join(sorted({one['commit'] for one in some if 'commit' in one}))
@@ -290,6 +292,44 @@ def table(arguments: argparse.Namespace) -> None:
     text = '\n'.join(lines) + '\n'
     (arguments.out / 'table.md').write_text(text)
     print(text, end='')
+
+
+COMPARED = {
+    *('task', 'composite', 'beta', 'delay', 'steps', 'phase_steps', 'warmup_steps', 'overlap'),
+    *('simulators', 'envs', 'memory_steps', 'score_missing', 'score_noise', 'score_levels', 'sac'),
+}
+"""Settings that a run must share with these to be shown beside them."""
+SHOWN = {'uniform': 'each score spread evenly', 'none': 'the raw scores'}
+RECORDED = Path(references.__file__).parent / 'recorded' / 'default_task.json'
+
+
+def record(arguments: argparse.Namespace) -> None:
+    """Write the curves that runs of the default task show beside their own."""
+    runs = by_method(read_runs(arguments.out))
+    curves = []
+    for name, label in SHOWN.items():
+        at: dict[int, list[float]] = {}
+        for one in runs[name]:
+            for evaluation in one['evaluations']:
+                at.setdefault(evaluation['step'], []).append(evaluation['true_return_mean'])
+        steps = sorted(at)
+        curves.append(
+            references.Curve(
+                label=label,
+                seeds=len(runs[name]),
+                steps=steps,
+                mean=[round(statistics.fmean(at[step]), 2) for step in steps],
+                low=[round(min(at[step]), 2) for step in steps],
+                high=[round(max(at[step]), 2) for step in steps],
+            )
+        )
+    own = runs['uniform'][0]
+    made = references.References(
+        settings={name: own['settings'][name] for name in sorted(COMPARED)},
+        commit=own['commit'],
+        curves=curves,
+    )
+    RECORDED.write_text(made.model_dump_json(indent=1) + '\n')
 
 
 def _with_sd(row: dict[str, Any], measure: str) -> str:
@@ -397,6 +437,8 @@ def main(given: Sequence[str] | None = None) -> int:
             failed = run(arguments)
         if arguments.what in ('all', 'table'):
             table(arguments)
+            if arguments.out.resolve() == RESULTS.resolve():
+                record(arguments)
         if arguments.what in ('all', 'plot'):
             plot(arguments)
     except (ResultsError, SettingsError) as error:

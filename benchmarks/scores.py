@@ -117,6 +117,7 @@ def _draw(path: Path, rows: list[dict[str, str]]) -> None:
     figure.tight_layout()
     figure.savefig(path, metadata={'Date': None})
     plt.close(figure)
+    path.write_text('\n'.join(line.rstrip() for line in path.read_text().splitlines()) + '\n')
 
 
 def main() -> None:

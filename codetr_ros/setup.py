@@ -20,6 +20,7 @@ setup(
         'codetr_ros': ['py.typed'],
         'codetr_ros.config.presets': ['*.yaml'],
         'codetr_ros.bags': ['msg/*.msg'],
+        'codetr_ros.runs.recorded': ['*.json'],
     },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),

@@ -16,6 +16,7 @@ from rich.text import Text
 
 from codetr_ros.config import Settings
 from codetr_ros.records import Commit, EpisodeResult, Metrics, Presence, Record
+from codetr_ros.runs import references
 from codetr_ros.runs.display import Display
 from codetr_ros.runs.numbers import exact, returns
 
@@ -62,6 +63,7 @@ class Progress(Display):
         self._missed: dict[str, int] = {}
         self._present: dict[str, str] = {}  # node -> role
         self._note = 'starting'
+        self._references = references.of(settings)
 
     def __enter__(self) -> 'Progress':
         super().__enter__()
@@ -96,7 +98,11 @@ class Progress(Display):
                 self._evaluation = []
             self._evaluation.append(result)
             if len(self._evaluation) == self._settings.evaluate_episodes:
-                self.log(f'after {result.step} steps: {self._of(self._evaluation)}')
+                beside = self._references.beside(result.step) if self._references else ''
+                self.log(
+                    f'after {result.step} steps: {self._of(self._evaluation)}'
+                    + (f'; recorded before: {beside}' if beside else '')
+                )
 
     @property
     def steps(self) -> int:

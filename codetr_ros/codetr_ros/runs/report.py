@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from codetr_ros.runs import course, document, pictures, segments
+from codetr_ros.runs import course, document, pictures, references, segments
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.document import (
     Block,
@@ -103,6 +103,15 @@ def draw(summary: RunSummary) -> bytes:
         below.set_ylabel('score\n(1: perfect)')
         below.set_xlabel('environment steps')
         below.set_xlim(0, summary.steps_planned)
+        if beside := references.of(summary.settings):
+            for other, style in zip(beside.curves, ('-.', ':'), strict=False):
+                label = f'{other.label} ({other.seeds} seeds, recorded)'
+                above.plot(
+                    other.steps, other.mean, style, color=pictures.GREY, lw=1.4, label=label
+                )
+                above.fill_between(
+                    other.steps, other.low, other.high, color=pictures.GREY, alpha=0.08, lw=0
+                )
         curve(above, 'true_return_mean', pictures.TRUE, worst, best, 'worst to best')
         curve(below, 'score_mean', _SCORE, low, high, 'standard deviation')
 

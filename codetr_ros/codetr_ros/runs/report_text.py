@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from codetr_ros.config import delay_in_words
+from codetr_ros.runs import references
 from codetr_ros.runs.numbers import exact, number, returns
 from codetr_ros.runs.run_summary import RewardRecovery, RunSummary
 
@@ -43,6 +44,7 @@ def result_rows(summary: RunSummary) -> list[tuple[str, str]]:
         ('score of the random policy', score(summary.random_score)),
         ('true return', (final or 'not evaluated') + (f' +- {spread}' if spread else '')),
         ('true return of the random policy', random or 'not evaluated'),
+        *_recorded(summary),
         ('reward recovery', _recovery(summary)),
         ('steps', f'{summary.steps} of {summary.steps_planned}'),
         ('phases', f'{summary.phases} of {summary.phases_planned}'),
@@ -52,6 +54,19 @@ def result_rows(summary: RunSummary) -> list[tuple[str, str]]:
             f'{sum(row.published for row in summary.messages.values())} published, '
             f'{summary.lost} lost, {summary.duplicated} duplicated, {summary.refused} refused',
         ),
+    ]
+
+
+def _recorded(summary: RunSummary) -> list[tuple[str, str]]:
+    """What others ended with after as many steps, where that was recorded before."""
+    beside = references.of(summary.settings)
+    if beside is None or not summary.evaluations:
+        return []
+    ends = [(curve, curve.at(summary.evaluations[-1].step)) for curve in beside.curves]
+    return [
+        (f'... with {curve.label}', f'{value:.1f}, mean of {curve.seeds} recorded runs')
+        for curve, value in ends
+        if value is not None
     ]
 
 
@@ -76,6 +91,10 @@ def learnt(summary: RunSummary) -> str:
     score = f', a score of {summary.final_score:.3f}' if summary.final_score is not None else ''
     values = returns(last, random)
     than = f' The random policy earns {values[1]}.' if random is not None else ''
+    others = ', '.join(
+        f'{name.removeprefix("... ")} {value}' for name, value in _recorded(summary)
+    )
+    than += f' Other runs of this task: {others}.' if others else ''
     return (
         f'After {summary.evaluations[-1].step} steps the policy earns {values[0]} an episode'
         f'{score}.{than}'
