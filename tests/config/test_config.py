@@ -51,6 +51,8 @@ def test_the_papers_table_is_what_the_paper_preset_says() -> None:
         ('steps', -5, 'steps = -5: Input should be greater than or equal to 1'),
         ('method', 'magic', "method = 'magic': Input should be 'codetr', 'none', 'rbt', 'rrd'"),
         ('composite', 'mean', "composite = 'mean': Input should be 'sum'"),
+        ('method', 'codtr', "'ones' (did you mean codetr?)"),
+        ('composite', 'sqare_sum', '(did you mean square_sum?)'),
         ('envs', 0, 'envs = 0: Input should be greater than or equal to 1'),
         ('envs', 65, 'envs = 65: Input should be less than or equal to 64'),
         ('sac.discount', 1.5, 'sac.discount = 1.5: Input should be less than or equal to 1'),
@@ -115,6 +117,16 @@ def test_every_fault_of_a_file_is_named_at_once(tmp_path: Path) -> None:
     assert len(lines) == 3
     assert all(line.startswith(f'{file}: ') for line in lines)
     assert f'{file}: stepz = 3: there is no such setting (did you mean steps?)' in lines
+
+
+def test_a_key_that_is_no_text_is_no_setting(tmp_path: Path) -> None:
+    file = tmp_path / 'mine.yaml'
+    file.write_text('5: 6\n')
+
+    with pytest.raises(SettingsError) as refused:
+        config.load(str(file))
+
+    assert str(refused.value) == f'{file}: 5: there is no such setting'
 
 
 @pytest.mark.parametrize(

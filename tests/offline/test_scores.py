@@ -428,10 +428,14 @@ def test_a_field_that_holds_no_time_is_named():
 @pytest.mark.parametrize(
     ('score', 'episode', 'expected'),
     [
-        ({'of': 'window'}, {}, 'seconds or begin must be given if `of` is window'),
+        ({'of': 'window'}, {}, 'score: seconds or begin must be given if `of` is window'),
         ({'seconds': 1.0}, {}, 'seconds means nothing if `of` is since_last: only for window'),
         ({'of': 'episode'}, {}, 'id or stamp must be given if `of` is episode, and not both'),
-        ({'of': 'episode', 'id': 'x'}, {}, 'score.id names an episode, but episodes have no na'),
+        (
+            {'of': 'episode', 'id': 'x'},
+            {},
+            'test: score.id names an episode, but episodes have no',
+        ),
         ({'of': 'window', 'seconds': 1.0, 'again_within': 1.0}, {}, 'again_within means nothing'),
         ({'late': -1.0}, {}, 'score.late = -1.0: Input should be greater than or equal to 0'),
         ({}, {'id': 'x'}, 'id without a topic'),

@@ -1,9 +1,11 @@
 """The base of all settings: how they are validated, and what a refusal names."""
 
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails
 
 from codetr_ros.system.parsing import shortened
 from codetr_ros.system.similar import did_you_mean
@@ -78,6 +80,19 @@ def names(kind: type[BaseModel], prefix: str = '') -> Iterator[str]:
             yield prefix + name
 
 
+def _reason(refusal: ErrorDetails, name: str, known: Iterable[str]) -> str:
+    """Why a value was refused, for people."""
+    if refusal['type'] in ('extra_forbidden', 'invalid_key'):  # a key that is no text is no name
+        return f'there is no such setting{did_you_mean(name, known)}'
+    context = refusal.get('ctx', {})
+    if words := _IN_WORDS.get(context.get('pattern', '')):
+        return f'must be {words}'
+    if refusal['type'] == 'literal_error' and isinstance(refusal['input'], str):
+        choices = re.findall(r"'([^']*)'", context['expected'])
+        return f'{refusal["msg"]}{did_you_mean(refusal["input"], choices)}'
+    return refusal['msg'].removeprefix('Value error, ')
+
+
 def explain(error: ValidationError, source: str, known: Iterable[str] = ()) -> str:
     """The refusals of pydantic, a line for each value: its source, name, value and the reason.
 
@@ -90,15 +105,11 @@ def explain(error: ValidationError, source: str, known: Iterable[str] = ()) -> s
     lines = []
     errors = error.errors()
     for e in errors[:_LINES]:
-        name = '.'.join(str(part) for part in e['loc']) or 'settings'
-        value = '' if isinstance(e['input'], Mapping) else f' = {shortened(repr(e["input"]))}'
-        if e['type'] == 'extra_forbidden':
-            reason = f'there is no such setting{did_you_mean(name, there)}'
-        elif words := _IN_WORDS.get(e.get('ctx', {}).get('pattern', '')):
-            reason = f'must be {words}'
-        else:
-            reason = e['msg']
-        lines.append(f'{source}: {shortened(name)}{value}: {reason}')
+        name = '.'.join(str(part) for part in e['loc'])
+        bare = e['type'] == 'invalid_key' or isinstance(e['input'], Mapping)
+        shown = '' if bare else f' = {shortened(repr(e["input"]))}'
+        given = f'{shortened(name)}{shown}: ' if name else ''  # else it is about several values
+        lines.append(f'{source}: {given}{_reason(e, name, there)}')
     if len(errors) > _LINES:
         lines.append(f'{source}: and {len(errors) - _LINES} more')
     return '\n'.join(lines)
