@@ -57,6 +57,8 @@ def test_the_report_is_one_file_that_fetches_nothing_from_elsewhere(tmp_path: Pa
 def test_its_links_lead_to_files_of_the_runs_folder(tmp_path: Path) -> None:
     run_folder.write_settings(tmp_path, SETTINGS)
     (tmp_path / 'bag').mkdir()
+    (tmp_path / 'bag' / 'bag_0.mcap').touch()
+    (tmp_path / 'logs').mkdir()  # of a run in process, without the output of a node
 
     page = written(tmp_path, run_summary())
 

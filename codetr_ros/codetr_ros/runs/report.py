@@ -263,7 +263,7 @@ def _material(folder: Path, film_note: str) -> Material:
         files=[
             (name + '/' * (folder / name).is_dir(), what)
             for name, what in FILES
-            if (folder / name).exists()
+            if (folder / name).is_file() or any((folder / name).glob('*'))  # no empty folder
         ],
         notes=notes,
     )
