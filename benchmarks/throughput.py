@@ -412,7 +412,7 @@ def main() -> int:
     load_at_start = machine.load()
     print(f'load average at the start: {load_at_start}', file=sys.stderr, flush=True)
     settings = load(arguments.config).changed({'steps': arguments.steps}, 'command line')
-    torch.set_num_threads(settings.threads)
+    torch.set_num_threads(settings.thread_count)
     flags = ['--config', arguments.config, '--steps', str(arguments.steps)]
     facts = circumstances(settings, flags, load_at_start)
     measured = Parts(settings)

@@ -80,6 +80,26 @@ def test_a_transformer_above_a_regression_is_the_same_over_topics(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize('overlap', [False, True])
+def test_two_threads_in_each_process_end_with_the_same_weights(tmp_path, two_threads, overlap):
+    # wide enough for products to be divided
+    wide = {'sac__hidden': (256, 256), 'sac__batch': 256, 'codetr__embedding': 64}
+    settings = tiny(threads=2, overlap=overlap, sac__updates_per_step=0.1, **wide)
+    topics, _ = train(settings, tmp_path / 'topics', installed=True)
+    check_same(topics, by_calls(settings))
+
+
+@pytest.fixture
+def two_threads():
+    """This process gets back the threads that it has."""
+    import torch
+
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.mark.slow
 def test_another_seed_pace_or_method_ends_with_other_weights():
     """What the equality above would miss if the digests were of something else."""
     changes = (

@@ -238,13 +238,17 @@ def test_nodes_look_at_this_host_only_unless_the_user_says_otherwise() -> None:
     settings = config.load('quick').changed({'threads': 3})
 
     plain = launcher.environment(settings, {'PATH': '/bin', 'OMP_NUM_THREADS': '64'})
-    opened = launcher.environment(settings, {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'})
+    opened = launcher.environment(
+        settings, {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET', 'GOMP_SPINCOUNT': '7'}
+    )
 
     assert plain['PATH'] == '/bin'
     assert plain['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
     assert plain['RMW_FASTRTPS_PUBLICATION_MODE'] == 'SYNCHRONOUS'
     assert plain['OMP_NUM_THREADS'] == '3', 'threads decide the bits: the setting wins'
     assert plain['OMP_WAIT_POLICY'] == 'PASSIVE'
+    assert plain['GOMP_SPINCOUNT'] == '2000'
+    assert opened['GOMP_SPINCOUNT'] == '7', 'no setting decides it, and it decides no bits'
     assert opened['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'SUBNET'
 
 

@@ -72,6 +72,21 @@ def test_a_delay_that_is_no_number_is_a_parameter_of_text(make_node, delay):
         parameters.check_against_run(make_node(delay=25), settings, 'learner /r/learner')
 
 
+def test_threads_that_a_node_leaves_to_the_machine_contradict_no_run(make_node):
+    settings = parameters.own_settings(make_node(threads='auto'), 'quick')
+    assert settings.threads == 'auto'
+    run = settings.changed({'threads': 2})
+    parameters.check_against_run(make_node(threads='auto'), run, 'learner /r/learner')
+    parameters.check_against_run(make_node(threads=2), run, 'learner /r/learner')
+    with pytest.raises(parameters.ParameterError, match='/r/learner has threads = 2'):
+        parameters.check_against_run(make_node(threads=1), run, 'learner /r/learner')
+    node = make_node()
+    parameters.declare_settings(node, run)
+    assert node.get_parameter('threads').value == 2
+    (threads,) = parameters.descriptor('threads', 2).integer_range
+    assert (threads.from_value, threads.to_value) == (1, 256)
+
+
 def test_an_unknown_parameter_is_refused_with_its_name_and_value(make_node):
     with pytest.raises(
         parameters.ParameterError,

@@ -141,6 +141,24 @@ class Folder:
             )
         return index
 
+    def threads(self) -> int | None:
+        """The number of threads of the cells; None if the benchmark has not begun.
+
+        Raises:
+            BenchmarkError: the spec in the folder cannot be read.
+        """
+        path = self.path / SPEC
+        if not path.is_file():
+            return None
+        try:
+            there = read_yaml(path)
+        except (OSError, ParseError) as error:
+            raise BenchmarkError(f'{path} cannot be read: {error}') from None
+        if not isinstance(there, dict):
+            raise BenchmarkError(f'{path} must hold a mapping, not {type(there).__name__}')
+        threads = dict(flatten(there)).get('config.threads')
+        return threads if isinstance(threads, int) else None
+
     @contextmanager
     def alone(self) -> Iterator[None]:
         """Keep every other runner out of this folder.

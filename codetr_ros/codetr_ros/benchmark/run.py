@@ -1,5 +1,6 @@
 """Run the unfinished cells of a benchmark, with an overview."""
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,6 +9,7 @@ from codetr_ros.benchmark.attempt import Job
 from codetr_ros.benchmark.folder import Folder, session
 from codetr_ros.benchmark.overview import Overview
 from codetr_ros.benchmark.spec import Spec
+from codetr_ros.config.threads import AUTO
 from codetr_ros.system import processors
 
 
@@ -39,6 +41,7 @@ def run(
             installed, or its cluster cannot be reached.
     """
     folder = Folder(out)
+    spec = settled(spec, folder, workers, ray)
     folder.check(spec)
     if ray is not None:
         ray_pool.check(ray)
@@ -69,6 +72,28 @@ def run(
     return failed | overview.failed
 
 
+def settled(spec: Spec, folder: Folder, workers: int, ray: str | None) -> Spec:
+    """The same benchmark with one number of threads for all cells, for it decides their bits.
+
+    A folder that is begun keeps its number, however many workers go on with it. For `auto`, cells
+    side by side share the cores; on Ray, which finds room for them by itself, each takes one.
+    """
+    cells = [cell.settings for cell in spec.cells]
+    if all(settings.threads != AUTO for settings in cells):
+        return spec
+    cores = workers if ray else processors.count()
+    threads = folder.threads() or min(one.threads_on(cores, workers) for one in cells)
+    chosen = {'threads': threads}
+    return dataclasses.replace(
+        spec,
+        base=spec.base.model_copy(update=chosen),
+        cells=tuple(
+            dataclasses.replace(cell, settings=cell.settings.model_copy(update=chosen))
+            for cell in spec.cells
+        ),
+    )
+
+
 def _todo(spec: Spec, folder: Folder, retry_failed: bool) -> tuple[list[Job], dict[str, str]]:
     """The cells to run, and the errors of failed cells that are not run again."""
     jobs: list[Job] = []
@@ -79,7 +104,7 @@ def _todo(spec: Spec, folder: Folder, retry_failed: bool) -> tuple[list[Job], di
         if state == 'failed' and not retry_failed:
             failed[cell.name] = folder.error(cell.name)
         elif state != 'finished':
-            threads = max(settings.threads, min(settings.envs, processors.count()))
+            threads = max(settings.thread_count, min(settings.envs, processors.count()))
             jobs.append(
                 Job(
                     cell=cell.name,

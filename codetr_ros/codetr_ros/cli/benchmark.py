@@ -35,9 +35,7 @@ class Run:
     out: Annotated[str, tyro.conf.arg(metavar='DIR', help="the benchmark's folder")]
     workers: Annotated[
         int,
-        tyro.conf.arg(
-            metavar='N', help='cells at a time, each with the number of threads in its settings'
-        ),
+        tyro.conf.arg(metavar='N', help='cells at a time; with threads auto they share the cores'),
     ] = 1
     ray: Annotated[
         str | None,

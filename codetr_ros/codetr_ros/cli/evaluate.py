@@ -1,6 +1,7 @@
 """`codetr evaluate`: measure the policy of a run's newest checkpoint."""
 
 import dataclasses
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +13,7 @@ from rich.table import Table
 from codetr_ros.cli import refuse
 from codetr_ros.cli.terminal import console, parse_arguments
 from codetr_ros.config import Settings, SettingsError
+from codetr_ros.processes.openmp import threading_environment
 from codetr_ros.records import EpisodeResult, Policy, RecordError
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.folder import RunFolderError
@@ -50,6 +52,7 @@ def main(arguments: Sequence[str]) -> int:
         settings = settings_to_read(folder).changed(changes, 'command line')
     except (RunFolderError, SettingsError) as error:
         return refuse(str(error))
+    os.environ.update(threading_environment(settings))
 
     from codetr_ros.learners.base import LearnerError
     from codetr_ros.runs.checkpoints import CheckpointError
@@ -148,7 +151,7 @@ def evaluate(policy: Policy, settings: Settings) -> list[EpisodeResult]:
 
     from codetr_ros.cores.evaluator import Evaluator
 
-    torch.set_num_threads(settings.threads)
+    torch.set_num_threads(settings.thread_count)
     evaluator = Evaluator(settings.run_spec(policy.run_id), settings, 'evaluate')
     evaluator.receive(policy)
     results: list[EpisodeResult] = []

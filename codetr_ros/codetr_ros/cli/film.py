@@ -114,6 +114,9 @@ def main(arguments: Sequence[str]) -> int:
         print(f'{type(error).__name__}: {error}'.splitlines()[0])
         return 1
     from codetr_ros.cli import evaluate
+    from codetr_ros.processes.openmp import waiting_environment
+
+    os.environ.update(waiting_environment())
     from codetr_ros.config import SettingsError
     from codetr_ros.learners.base import LearnerError
     from codetr_ros.runs.checkpoints import CheckpointError
@@ -148,7 +151,7 @@ def draw(folder: Path, settings: 'Settings', policy: Any) -> str:
     from codetr_ros.simulation.episode import EpisodeRunner
     from codetr_ros.simulation.permission import acting_policy
 
-    torch.set_num_threads(settings.threads)
+    torch.set_num_threads(settings.thread_count)
     seed_global(settings.seed, 'environment')
     environment = tasks.make(settings.task)
     acting = acting_policy(policy, environment, settings)

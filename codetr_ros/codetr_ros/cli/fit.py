@@ -1,6 +1,7 @@
 """`codetr fit`: fit a reward model to bags, without any node."""
 
 import dataclasses
+import os
 import sys
 import time
 from collections.abc import Sequence
@@ -18,6 +19,7 @@ from codetr_ros.cli.terminal import console, parse_arguments
 from codetr_ros.config import Settings, SettingsError
 from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.settings import OF_NO_EFFECT, FitSettings
+from codetr_ros.processes.openmp import waiting_environment
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.folder import RunFolderError
 from codetr_ros.runs.numbers import exact
@@ -112,7 +114,7 @@ def parse(arguments: Sequence[str], base: Settings) -> Arguments:
         mine['checkpoint'],
         mine['frozen'],
         config.validate(FitSettings, fitting, 'command line'),
-        config.parse(base.model_dump() | values, 'command line'),
+        config.settled(config.parse(base.model_dump() | values, 'command line')),
     )
 
 
@@ -123,6 +125,7 @@ def main(arguments: Sequence[str]) -> int:
         run_folder.check(given.out)
     except (SettingsError, RunFolderError) as error:
         return refuse(str(error))
+    os.environ.update(waiting_environment())
     from codetr_ros.rewards.base import RewardModelError
     from codetr_ros.runs.checkpoints import CheckpointError
     from codetr_ros.system.devices import DeviceError

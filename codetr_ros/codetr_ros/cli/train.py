@@ -20,6 +20,7 @@ from codetr_ros.cli.train_flags import FLAGS, PEER_DEADLINE, wrong
 from codetr_ros.config import Settings, SettingsError
 from codetr_ros.processes import launcher
 from codetr_ros.processes.launcher import LaunchError
+from codetr_ros.processes.openmp import threading_environment
 from codetr_ros.processes.supervise import Interrupts, Silence, supervise, why_it_gave_up
 from codetr_ros.records import Record
 from codetr_ros.runs import folder as run_folder
@@ -85,7 +86,7 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
             )
         if in_process:
             # before torch is imported: the threads of the nodes, for the same results bit for bit
-            os.environ.update(launcher.threading_environment(settings))
+            os.environ.update(threading_environment(settings))
         tasks.check(settings, tasks.find(settings.task))
         if not in_process:
             for role in settings.roles:
@@ -144,6 +145,7 @@ def train(
     Returns:
         The exit code: 0 finished, 1 failed, 2 refused, 130 interrupted.
     """
+    settings = config.settled(settings)
     try:
         run_folder.write_settings(folder, settings)
     except OSError as error:
@@ -189,7 +191,7 @@ def _in_process(
     progress: Progress,
     interrupts: Interrupts,
 ) -> Outcome:
-    os.environ.update(launcher.threading_environment(settings))
+    os.environ.update(threading_environment(settings))
     from codetr_ros.cores import in_process
 
     def observe(record: Record) -> None:

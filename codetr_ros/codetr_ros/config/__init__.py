@@ -36,6 +36,7 @@ from codetr_ros.config.methods import (
     SacSettings,
 )
 from codetr_ros.config.run import Settings
+from codetr_ros.config.threads import settled
 
 __all__ = [
     'IN_PROCESS_ONLY',
@@ -70,5 +71,6 @@ __all__ = [
     'names',
     'nearest',
     'parse',
+    'settled',
     'validate',
 ]

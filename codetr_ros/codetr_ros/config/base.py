@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -38,6 +39,14 @@ class Group(BaseModel):
     model_config = ConfigDict(
         extra='forbid', frozen=True, validate_default=True, allow_inf_nan=False
     )
+
+
+@dataclass(frozen=True)
+class Whole:
+    """The bounds of a setting where it is a whole number, for people."""
+
+    ge: int
+    le: int
 
 
 def flatten(data: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:

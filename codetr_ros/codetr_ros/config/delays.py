@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import BeforeValidator
 from pydantic_core import PydanticCustomError
 
-from codetr_ros.config.base import SettingsError
+from codetr_ros.config.base import SettingsError, Whole
 from codetr_ros.records import I64
 
 LONGEST = 100_000
@@ -100,14 +100,6 @@ def delay_in_words(delay: int | str) -> str:
     if lengths.most is None:
         return 'whole episodes'
     return f'{lengths.least} to {lengths.most} steps' if lengths.drawn else f'{delay} steps'
-
-
-@dataclass(frozen=True)
-class Whole:
-    """The bounds of a setting where it is a whole number, for people."""
-
-    ge: int
-    le: int
 
 
 Delay = Annotated[int | str, BeforeValidator(checked), Whole(1, LONGEST)]

@@ -7,6 +7,7 @@ from typing import Any
 
 from codetr_ros.config.base import SettingsError, flatten, validate
 from codetr_ros.config.run import Settings
+from codetr_ros.config.threads import AUTO
 from codetr_ros.system.parsing import ParseError, parse_json, parse_yaml, read_yaml
 from codetr_ros.system.similar import did_you_mean
 
@@ -59,13 +60,14 @@ def differences(settings: Mapping[str, Any], preset: str) -> list[tuple[str, Any
 
     Args:
         settings: nested mapping, as JSON has it; it may be of an earlier version of the program.
-        preset: name of the preset. A setting that it does not know is None there.
+        preset: name of the preset. A setting that it does not know is None there; threads that it
+            leaves to the machine differ from no number.
     """
     there = dict(flatten(load(preset).model_dump(mode='json')))
     return [
         (name, there.get(name), value)
         for name, value in flatten(settings)
-        if name not in there or value != there[name]
+        if name not in there or (value != there[name] and (name, there[name]) != ('threads', AUTO))
     ]
 
 

@@ -31,6 +31,7 @@ from codetr_ros.config.methods import (
     SacSettings,
 )
 from codetr_ros.config.schedule import Schedule
+from codetr_ros.config.threads import Threaded, Threads
 from codetr_ros.records import PROTOCOL_VERSION, RunSpec
 
 _DEVICE = in_words(
@@ -38,7 +39,7 @@ _DEVICE = in_words(
 )
 
 
-class Settings(Schedule, Delayed, Group):
+class Settings(Schedule, Delayed, Threaded, Group):
     """Everything that the nodes of a run must agree on."""
 
     task: str = Field(
@@ -146,7 +147,12 @@ class Settings(Schedule, Delayed, Group):
         description='labels in the bag: the first of each segment and, at evaluations, all labels '
         'of the phase; or every label',
     )
-    threads: int = Field(1, ge=1, le=256, description='torch threads of each process')
+    threads: Threads = Field(
+        'auto',
+        description='torch threads of each process, which decide the last bits; auto: when the '
+        'run is made, the cores that a stage has to itself where SAC gains from them, at most 4, '
+        'else 1',
+    )
     device: str = Field(
         'cpu',
         pattern=_DEVICE,

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import torch
 
-from codetr_ros.config import Settings
+from codetr_ros.config import Settings, settled
 from codetr_ros.cores.core import Core
 from codetr_ros.cores.evaluator import Evaluator
 from codetr_ros.cores.labeller import Labeller
@@ -39,7 +39,7 @@ def run(
     """Run Algorithm 1 to its end.
 
     Args:
-        settings: the run's settings.
+        settings: the run's settings; `threads` auto is decided here.
         run_id: its name.
         folder: where checkpoints and reports go; None: neither is written.
         observe: called with every record, in order. An error that it raises ends the run, after a
@@ -52,7 +52,8 @@ def run(
     Raises:
         RuntimeError: every part waits for another, which is a fault of this program.
     """
-    torch.set_num_threads(settings.threads)
+    settings = settled(settings)
+    torch.set_num_threads(settings.thread_count)
     spec = settings.run_spec(run_id)
     checkpoints = folder / run_folder.CHECKPOINTS if folder else None
     cores: dict[str, tuple[str, Core[Record]]] = {

@@ -156,7 +156,7 @@ def fit(
         FitError: a bag has changed since it was indexed.
         RewardModelError: training has diverged before anything was learnt.
     """
-    torch.set_num_threads(settings.threads)
+    torch.set_num_threads(settings.thread_count)
     began = time.perf_counter()
     method = method or registry.make(settings, *sizes)
     held_out = load(bags, made.held_out, sizes, settings.longest, true_rewards=True)

@@ -103,7 +103,7 @@ def fold(
         RewardModelError: the checkpoint is of another method, size or shape, or training has
             diverged.
     """
-    torch.set_num_threads(settings.threads)
+    torch.set_num_threads(settings.thread_count)
     core = Labeller(run, settings, NODE, folder, checkpoint, frozen)
     folded = Fold(core, run, settings, 0, [], core.refused, Recorded())
     kinds = (*core.subscribes, StepRewards)

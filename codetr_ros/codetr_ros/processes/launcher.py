@@ -19,6 +19,7 @@ from typing import BinaryIO, Protocol
 
 from codetr_ros.config import Settings
 from codetr_ros.processes import middleware
+from codetr_ros.processes.openmp import threading_environment
 from codetr_ros.records import roles
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.system import modules
@@ -124,7 +125,7 @@ def environment(settings: Settings, environ: Mapping[str, str] = os.environ) -> 
         **middleware.DEFAULTS,
         'PYTHONUNBUFFERED': '1',
         **environ,
-        **threading_environment(settings),
+        **threading_environment(settings, environ),
         **module_environment(settings, environ),
     }
 
@@ -138,15 +139,6 @@ def module_environment(
     module = modules.of_task(settings.task)
     path = '' if module is None else modules.search_path(module, environ.get('PYTHONPATH', ''))
     return {'PYTHONPATH': path} if path else {}
-
-
-def threading_environment(settings: Settings) -> dict[str, str]:
-    """Environment variables that set how many threads torch and numpy use, and how they wait."""
-    return {
-        'OMP_NUM_THREADS': str(settings.threads),
-        # Spinning OpenMP threads of several processes starve each other on few cores.
-        'OMP_WAIT_POLICY': 'PASSIVE',
-    }
 
 
 def end_with_parent(number: signal.Signals = signal.SIGINT) -> Callable[[], None] | None:

@@ -1,5 +1,6 @@
 """How a node joins a run: it learns of the run, takes its settings and makes the core."""
 
+import os
 import secrets
 import sys
 import time
@@ -8,8 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from codetr_ros.config import IN_PROCESS_ONLY, Settings, from_canonical
+from codetr_ros.config import IN_PROCESS_ONLY, Settings, from_canonical, settled
 from codetr_ros.cores.core import Core
+from codetr_ros.processes.openmp import threading_environment
 from codetr_ros.records import RunSpec
 from codetr_ros.records.roles import command
 from codetr_ros.ros import parameters
@@ -87,7 +89,8 @@ def refuse_used_folder(who: str, folder: Path, settings: Settings) -> None:
         SettingsError: its settings cannot be read.
     """
     remedy = 'give the parameter folder another one, or remove it'
-    if (folder / run_folder.CONFIG).is_file() and run_folder.read_settings(folder) != settings:
+    path = folder / run_folder.CONFIG
+    if path.is_file() and settled(run_folder.read_settings(folder)) != settings:
         raise NodeError(
             f'{who}: folder {folder} holds another run, its {run_folder.CONFIG} has other '
             f'settings: {remedy}'
@@ -109,7 +112,7 @@ def own_run(member: Membership) -> tuple[RunSpec, Settings]:
         TaskError: the task is unknown or cannot be used.
     """
     who = member.link.full_name
-    settings = parameters.own_settings(member.link.node, member.values['config'])
+    settings = settled(parameters.own_settings(member.link.node, member.values['config']))
     refuse_in_process_only(who, settings)
     tasks.check(settings, tasks.find(settings.task))
     if member.folder:
@@ -149,13 +152,14 @@ def join(
     if announce is not None:
         link.advertise(['run'], settings)
         link.publish(run)
+    os.environ.update(threading_environment(settings))  # read when torch is imported
     try:
         with member.stop.cutting_short():
             make_core = load_core()
     except Stopped:
         return None
     if 'torch' in sys.modules:  # the recorder has no torch and needs none
-        sys.modules['torch'].set_num_threads(settings.threads)
+        sys.modules['torch'].set_num_threads(settings.thread_count)
     folder = member.folder
     if announce is not None and folder and not (folder / run_folder.CONFIG).exists():
         make_folder(folder)

@@ -19,7 +19,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from codetr_ros.config import Settings, SettingsError, load
-from codetr_ros.config.delays import Whole
+from codetr_ros.config.base import Whole
+from codetr_ros.config.threads import AUTO
 
 Type = Parameter.Type
 NOT_GIVEN = 0.0
@@ -303,6 +304,8 @@ def check_against_run(node: Node, settings: Settings, owner: str) -> None:
     run = settings.flat()
     wrong = []
     for name, value in given.items():
+        if (name, value) == ('threads', AUTO):
+            continue  # the learner decides what it is
         try:
             same = (
                 settings.changed({name: _inward(name, value)}, f'{name_of_node}: parameter')

@@ -40,6 +40,7 @@ def origin(summary: RunSummary, files: Sequence[tuple[str, str]]) -> Iterator[Bl
         ('on', summary.host or 'not recorded'),
         ('command', summary.command or 'not recorded'),
         ('run as', 'one process' if summary.in_process else 'ROS 2 nodes'),
+        ('threads', f'{summary.settings.get("threads", "not recorded")} in each process'),
         ('versions', ', '.join(f'{name} {version}' for name, version in versions.items())),
     ]
     yield Heading('How it was made')

@@ -1,0 +1,39 @@
+"""How many threads OpenMP starts in a process that computes, and how they wait for work.
+
+torch and numpy compute with them. OpenMP reads these variables once, when torch is imported.
+"""
+
+import os
+from collections.abc import Mapping
+
+from codetr_ros.config import Settings
+
+SPINS = 2000
+"""Rounds that an OpenMP thread spins before it sleeps: some microseconds, as long as the gap
+between two products (docs/decisions/0021-threads-where-they-pay.md).
+"""
+
+
+def threading_environment(
+    settings: Settings, environ: Mapping[str, str] = os.environ
+) -> dict[str, str]:
+    """Environment variables that set how many threads torch and numpy use, and how they wait.
+
+    OpenMP reads them once, when torch is imported: they must be set before.
+
+    Args:
+        settings: the run's settings.
+        environ: the environment of this process; a `GOMP_SPINCOUNT` in it stays.
+    """
+    return {'OMP_NUM_THREADS': str(settings.thread_count), **waiting_environment(environ)}
+
+
+def waiting_environment(environ: Mapping[str, str] = os.environ) -> dict[str, str]:
+    """The part of `threading_environment` that no setting decides: how threads wait."""
+    return {
+        # Threads that spin for long starve those of other processes on few cores.
+        'OMP_WAIT_POLICY': 'PASSIVE',
+        # But a thread that sleeps between two products wakes too late for the second. GNU's
+        # OpenMP heeds this number before the policy, unless it has more threads than cores.
+        'GOMP_SPINCOUNT': environ.get('GOMP_SPINCOUNT', str(SPINS)),
+    }
