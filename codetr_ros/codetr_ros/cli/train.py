@@ -20,7 +20,7 @@ from codetr_ros.cli.train_flags import FLAGS, PEER_DEADLINE, wrong
 from codetr_ros.config import Settings, SettingsError
 from codetr_ros.processes import launcher
 from codetr_ros.processes.launcher import LaunchError
-from codetr_ros.processes.openmp import threading_environment
+from codetr_ros.processes.openmp import crowded, threading_environment
 from codetr_ros.processes.supervise import Interrupts, Silence, supervise, why_it_gave_up
 from codetr_ros.records import Record
 from codetr_ros.runs import folder as run_folder
@@ -158,6 +158,8 @@ def train(
         + (', in process' if topics is None else '')
     )
     progress.log(f'output: {results.short(folder)}')
+    if reason := crowded(settings.thread_count, os.getloadavg()[0]):
+        progress.log(reason)
     if topics is not None:
         progress.log(f'namespace: {topics.namespace or launcher.namespace_of(run_id)}')
     with Interrupts() as interrupts:

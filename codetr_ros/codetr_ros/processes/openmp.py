@@ -7,6 +7,7 @@ import os
 from collections.abc import Mapping
 
 from codetr_ros.config import Settings
+from codetr_ros.system import processors
 
 SPINS = 2000
 """Rounds that an OpenMP thread spins before it sleeps: some microseconds, as long as the gap
@@ -37,3 +38,21 @@ def waiting_environment(environ: Mapping[str, str] = os.environ) -> dict[str, st
         # OpenMP heeds this number before the policy, unless it has more threads than cores.
         'GOMP_SPINCOUNT': environ.get('GOMP_SPINCOUNT', str(SPINS)),
     }
+
+
+def crowded(threads: int, load: float) -> str | None:
+    """Why so many threads will be slow here; None if the machine has room for them.
+
+    A thread that shares its core with another program keeps all others waiting.
+
+    Args:
+        threads: of a process.
+        load: load average of the machine before it starts.
+    """
+    cores = processors.count()
+    if threads == 1 or load + threads < cores + 1:
+        return None
+    return (
+        f'{threads} threads in each process, and other programs keep {load:.1f} of {cores} cores '
+        'busy: one thread, --threads 1, may be several times as fast'
+    )
