@@ -45,8 +45,8 @@ WAITS = {
     'spin 20000': '20000',
     "OpenMP's own (300000)": '300000',
 }
-SHORT = ['--config', 'cpu', '--steps', '4000', '--warmup-steps', '1000']
-SIZES = ((256, 256), (256, 128), (256, 64), (128, 128))
+SHORT = ['--config', 'cpu', '--steps', '3000', '--warmup-steps', '1000']
+SIZES = ((256, 256), (128, 128))
 """Width and batch."""
 
 
