@@ -136,7 +136,8 @@ def runs(some: Runs, rounds: int) -> Iterator[dict[str, object]]:
     two = [*some.flags, '--threads', '2']
     ways: dict[str, tuple[list[str], dict[str, str]]] = {
         BEFORE: ([*some.flags, '--threads', '1'], {'GOMP_SPINCOUNT': '0'}),
-        '2 threads': (two, {}),
+        '2 threads, spin 20000': (two, {'GOMP_SPINCOUNT': '20000'}),
+        '2 threads, spin 2000': (two, {'GOMP_SPINCOUNT': '2000'}),
     }
     what = f'codetr train {" ".join(some.flags)}' + ' --in-process' * some.in_process
     what += f', {some.at_a_time} at a time' * (some.at_a_time > 1)
