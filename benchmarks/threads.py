@@ -181,16 +181,16 @@ def table(rows: Iterable[dict[str, str]], facts: Mapping[str, str]) -> str:
         '|---|---|---|---:|---:|---:|---:|',
     ]
     for (part, what), ways in by_what.items():
-        first = [float(row['value']) for row in next(iter(ways.values()))]
+        first = {row['round']: float(row['value']) for row in next(iter(ways.values()))}
         for way, some in ways.items():
             values = [float(row['value']) for row in some]
             unit = some[0]['unit']
-            pairs = zip(first, values, strict=False)
+            pairs = [(first[r['round']], float(r['value'])) for r in some if r['round'] in first]
             ratios = [a / b if unit == 's' else b / a for a, b in pairs]
             updates = [float(row['update_s']) for row in some if row['update_s']]
             cells = [part, what, way, f'{machine.spread(values, ".1f")} {unit}']
             cells.append(f'{statistics.median(updates):.1f}' if updates else '')
-            cells.append(machine.spread(ratios, '.2f'))
+            cells.append(machine.spread(ratios, '.2f') if ratios else '')
             cells.append(f'{max(float(row["others"]) for row in some):.2f}')
             lines.append(f'| {" | ".join(cells)} |')
     lines += ['', *(f'- {name}: {fact}' for name, fact in facts.items())]
@@ -218,7 +218,7 @@ def main() -> int:
             full = {'part': part, 'commit': facts['commit']} | row | numbers
             print(*full.values(), flush=True)
             with arguments.out.open('a', newline='') as file:
-                csv.DictWriter(file, COLUMNS).writerow(full)
+                csv.DictWriter(file, COLUMNS, lineterminator='\n').writerow(full)
     with arguments.out.open(newline='') as file:
         text = table(csv.DictReader(file), facts)
     arguments.out.with_suffix('.md').write_text(text)
