@@ -13,6 +13,7 @@ pytest.importorskip('rclpy', reason='needs ROS')
 from rcl_interfaces.msg import ParameterType
 from rosbags.highlevel import AnyReader
 
+from codetr_ros.config import settled
 from codetr_ros.processes import launcher
 from codetr_ros.records import TOPICS, TrueRewards
 from codetr_ros.records.roles import command, readers
@@ -180,7 +181,7 @@ def test_only_the_recorder_hears_the_true_rewards(stopped):
 
 
 def test_every_parameter_is_listed_and_described_at_every_node(stopped):
-    settings = stopped.nodes.settings.flat()
+    settings = settled(stopped.nodes.settings).flat()
     for name in stopped.nodes.names:
         shown = stopped.parameters[name]
         assert set(settings) < set(shown)
