@@ -164,57 +164,14 @@ def memories(
     ]
     counts = [0, 0]
     scores: list[list[CompositeReward]] = [[], []]
-    for episode in range(len(data['finals'])):
+    for episode, final in enumerate(data['finals']):
         rows = np.flatnonzero(data['episodes'] == episode)
         side = int(episode % 5 == 4)
-        number, memory = counts[side], made[side]
+        steps, true = _recorded(data, rows, final, counts[side])
         counts[side] += 1
-        observations = np.concatenate([data['observations'][rows], data['finals'][episode][None]])
-        n = len(rows)
-        memory.append(
-            Transitions(
-                run_id='',
-                source='s',
-                sequence=number,
-                phase=0,
-                episode=number,
-                first_step=0,
-                steps=n,
-                observations=observations,
-                actions=data['actions'][rows],
-                terminated=False,
-                truncated=True,
-                phase_end=False,
-                scores_due=0,
-            )
-        )
-        true = data['rewards'][rows]
-        memory.append_true_rewards(
-            TrueRewards(
-                run_id='',
-                source='s',
-                sequence=number,
-                phase=0,
-                episode=number,
-                first_step=0,
-                rewards=true,
-            )
-        )
-        for first in range(0, n, delay):
-            part = true[first : first + delay].astype(np.float64)
-            value = composite(settings.composite, part, settings.beta, delay)
-            scores[side].append(
-                CompositeReward(
-                    run_id='',
-                    source='s',
-                    scorer='s',
-                    sequence=0,
-                    episode=number,
-                    first_step=first,
-                    length=len(part),
-                    value=value,
-                )
-            )
+        made[side].append(steps)
+        made[side].append_true_rewards(true)
+        scores[side] += _scored(settings, true)
     values = np.array([score.value for score in scores[0]])
     if disturb is not None:
         values = disturb(values)
@@ -224,6 +181,58 @@ def memories(
     for score in scores[1]:
         made[1].score(score)
     return made[0], made[1]
+
+
+def _recorded(
+    data: dict[str, np.ndarray], rows: np.ndarray, final: np.ndarray, number: int
+) -> tuple[Transitions, TrueRewards]:
+    """An episode: its steps, and their true rewards."""
+    steps = Transitions(
+        run_id='',
+        source='s',
+        sequence=number,
+        phase=0,
+        episode=number,
+        first_step=0,
+        steps=len(rows),
+        observations=np.concatenate([data['observations'][rows], final[None]]),
+        actions=data['actions'][rows],
+        terminated=False,
+        truncated=True,
+        phase_end=False,
+        scores_due=0,
+    )
+    true = TrueRewards(
+        run_id='',
+        source='s',
+        sequence=number,
+        phase=0,
+        episode=number,
+        first_step=0,
+        rewards=data['rewards'][rows],
+    )
+    return steps, true
+
+
+def _scored(settings: Settings, true: TrueRewards) -> list[CompositeReward]:
+    """Exact scores of an episode."""
+    n, scores = settings.longest, []
+    for first in range(0, len(true.rewards), n):
+        part = true.rewards[first : first + n].astype(np.float64)
+        value = composite(settings.composite, part, settings.beta, n)
+        scores.append(
+            CompositeReward(
+                run_id='',
+                source='s',
+                scorer='s',
+                sequence=0,
+                episode=true.episode,
+                first_step=first,
+                length=len(part),
+                value=value,
+            )
+        )
+    return scores
 
 
 def measure(
