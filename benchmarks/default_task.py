@@ -299,7 +299,7 @@ COMPARED = {
     *('simulators', 'envs', 'memory_steps', 'score_missing', 'score_noise', 'score_levels', 'sac'),
 }
 """Settings that a run must share with these to be shown beside them."""
-SHOWN = {'uniform': 'each score spread evenly', 'none': 'the raw scores'}
+SHOWN = {'uniform': 'an even spread', 'none': 'raw scores'}
 RECORDED = Path(references.__file__).parent / 'recorded' / 'default_task.json'
 
 

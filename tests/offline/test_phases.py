@@ -8,6 +8,7 @@ import pytest
 
 from codetr_ros import cli
 from codetr_ros.bags.verify import verify
+from codetr_ros.config import threads
 from codetr_ros.cores import in_process
 from codetr_ros.records import Commit, CompositeReward, Record, RunSpec, StepRewards, Transitions
 from codetr_ros.runs import checkpoints
@@ -99,7 +100,7 @@ def test_the_last_checkpoint_holds_these_very_weights(a_run, tmp_path):
     tensors, meta = checkpoints.load(newest)
     assert checkpoints.digest(tensors) == said[DIGEST]
     assert (meta['observation_size'], meta['action_size']) == (10, 2)
-    assert meta['settings'] == a_run.settings.canonical()
+    assert meta['settings'] == threads.settled(a_run.settings).canonical()
 
 
 def test_a_setting_that_the_run_did_not_have_is_said_and_teaches_something_else(a_run, tmp_path):

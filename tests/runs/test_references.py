@@ -18,8 +18,8 @@ def test_the_default_task_has_curves_of_the_even_spread_and_of_raw_scores() -> N
 
     assert beside is not None, 'run benchmarks/default_task.py again: the preset has changed'
     assert [curve.label for curve in beside.curves] == [
-        'each score spread evenly',
-        'the raw scores',
+        'an even spread',
+        'raw scores',
     ]
     for curve in beside.curves:
         assert curve.seeds == 10

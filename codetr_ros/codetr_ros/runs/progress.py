@@ -98,11 +98,10 @@ class Progress(Display):
                 self._evaluation = []
             self._evaluation.append(result)
             if len(self._evaluation) == self._settings.evaluate_episodes:
+                self.log(f'after {result.step} steps: {self._of(self._evaluation)}')
                 beside = self._references.beside(result.step) if self._references else ''
-                self.log(
-                    f'after {result.step} steps: {self._of(self._evaluation)}'
-                    + (f'; recorded before: {beside}' if beside else '')
-                )
+                if beside:
+                    self.log(f'    others by then, recorded before: {beside}', 'dim')
 
     @property
     def steps(self) -> int:
