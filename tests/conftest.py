@@ -13,7 +13,12 @@ os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 # before anything imports torch: on small networks a second thread only waits for the first
 os.environ['OMP_NUM_THREADS'] = '1'
 
+import hypothesis
 import pytest
+
+# how long an example takes says nothing on a machine that does other things too
+hypothesis.settings.register_profile('untimed', deadline=None)
+hypothesis.settings.load_profile('untimed')
 
 ROS = importlib.util.find_spec('rclpy') is not None
 collect_ignore_glob = [] if ROS else ['ros/*', 'graph/*']
