@@ -51,7 +51,7 @@ def test_both_losses_are_those_of_their_formulas_step_by_step():
     unit, cuts = data.segments.score_scale(), set()
     for seed in range(4):
         batch, cut = drawn(data, settings(), seed)
-        steps, rewards = made._steps(batch).double().numpy(), made._step_rewards(batch)
+        steps, rewards = made._step_inputs(batch).double().numpy(), made._step_rewards(batch)
         scores, apart = [], []
         for i, (m, value) in enumerate(zip(batch.lengths.tolist(), batch.values, strict=True)):
             parts = [part for part in np.split(steps[i, :m], [cut]) if len(part)]

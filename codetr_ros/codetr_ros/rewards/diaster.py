@@ -69,7 +69,7 @@ class Diaster(Learned):
         """`reward_loss` of the cut segments, and `step_loss` of the step rewards."""
         batch = memory.segments.batch(draw_by_length(memory, rng, self._settings.diaster.batch))
         cut = int(rng.integers(1, batch.actions.shape[1] + 1))
-        steps = self._steps(batch)
+        steps = self._step_inputs(batch)
         lengths, returns = self._put(batch.lengths), self._scaled(batch.values)
         worth = self.network.cut_worth(steps, lengths, cut)  # (B,)
         with torch.no_grad():
@@ -82,11 +82,7 @@ class Diaster(Learned):
         }
 
     def _step_rewards(self, batch: SegmentBatch) -> Tensor:
-        return self.network.rewards(self._steps(batch))
-
-    def _steps(self, batch: SegmentBatch) -> Tensor:
-        observations = self._standardised(batch.observations[:, :-1])  # (B, L, O)
-        return torch.cat([observations, self._put(batch.actions)], -1)  # (B, L, O + A)
+        return self.network.rewards(self._step_inputs(batch))
 
 
 class SubTrajectories(nn.Module):

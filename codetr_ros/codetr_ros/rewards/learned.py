@@ -192,6 +192,11 @@ class Learned(Predictor):
             return standardised.clamp(-self.clip, self.clip)
         return standardised
 
+    def _step_inputs(self, batch: SegmentBatch) -> Tensor:
+        """States and actions (B, L, O + A), as networks of single steps see them."""
+        observations = self._standardised(batch.observations[:, :-1])  # (B, L, O)
+        return torch.cat([observations, self._put(batch.actions)], -1)
+
     def _scaled(self, values: F64) -> Tensor:
         """Composite rewards (B,) in units of c."""
         return self._put((values / self.target_scale).astype(np.float32))

@@ -124,10 +124,6 @@ class Lrr(Learned):
         means: Tensor = self.network(self._step_inputs(batch))[..., 0]  # (B, L)
         return means
 
-    def _step_inputs(self, batch: SegmentBatch) -> Tensor:
-        observations = self._standardised(batch.observations[:, :-1])  # (B, L, O)
-        return torch.cat([observations, self._put(batch.actions)], -1)  # (B, L, O + A)
-
     def _parts(self, batch: SegmentBatch) -> Sequence[SegmentBatch]:
         """The batch in parts with at most `ENTRIES` pairs of steps, one segment at the least."""
         windows, steps = batch.actions.shape[:2]

@@ -72,9 +72,7 @@ class MilLstm(Learned):
         yield {'reward_loss': F.mse_loss(predicted, self._scaled(batch.values))}
 
     def _step_rewards(self, batch: SegmentBatch) -> Tensor:
-        observations = self._standardised(batch.observations[:, :-1])  # (B, L, O)
-        steps = torch.cat([observations, self._put(batch.actions)], -1)  # (B, L, O + A)
-        rewards: Tensor = self.network(steps)
+        rewards: Tensor = self.network(self._step_inputs(batch))
         return rewards
 
 

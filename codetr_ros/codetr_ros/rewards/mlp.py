@@ -13,7 +13,6 @@ from collections.abc import Iterator, Sequence
 from typing import ClassVar
 
 import numpy as np
-import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -42,9 +41,7 @@ class Mlp(Learned):
         yield {'reward_loss': F.mse_loss(predicted, self._scaled(batch.values))}
 
     def _step_rewards(self, batch: SegmentBatch) -> Tensor:
-        observations = self._standardised(batch.observations[:, :-1])  # (B, L, O)
-        inputs = torch.cat([observations, self._put(batch.actions)], -1)  # (B, L, O + A)
-        rewards: Tensor = self.network(inputs).squeeze(-1)  # (B, L)
+        rewards: Tensor = self.network(self._step_inputs(batch)).squeeze(-1)  # (B, L)
         return rewards
 
 

@@ -44,7 +44,7 @@ def result_rows(summary: RunSummary) -> list[tuple[str, str]]:
         ('score of the random policy', score(summary.random_score)),
         ('true return', (final or 'not evaluated') + (f' +- {spread}' if spread else '')),
         ('true return of the random policy', random or 'not evaluated'),
-        *_recorded(summary),
+        *((f'... {name}', value) for name, value in _recorded(summary)),
         ('reward recovery', _recovery(summary)),
         ('steps', f'{summary.steps} of {summary.steps_planned}'),
         ('phases', f'{summary.phases} of {summary.phases_planned}'),
@@ -64,7 +64,7 @@ def _recorded(summary: RunSummary) -> list[tuple[str, str]]:
         return []
     ends = [(curve, curve.at(summary.evaluations[-1].step)) for curve in beside.curves]
     return [
-        (f'... with {curve.label}', f'{value:.1f}, mean of {curve.seeds} recorded runs')
+        (f'with {curve.label}', f'{value:.1f}, mean of {curve.seeds} recorded runs')
         for curve, value in ends
         if value is not None
     ]
@@ -91,9 +91,7 @@ def learnt(summary: RunSummary) -> str:
     score = f', a score of {summary.final_score:.3f}' if summary.final_score is not None else ''
     values = returns(last, random)
     than = f' The random policy earns {values[1]}.' if random is not None else ''
-    others = ', '.join(
-        f'{name.removeprefix("... ")} {value}' for name, value in _recorded(summary)
-    )
+    others = ', '.join(f'{name} {value}' for name, value in _recorded(summary))
     than += f' Other runs of this task: {others}.' if others else ''
     return (
         f'After {summary.evaluations[-1].step} steps the policy earns {values[0]} an episode'

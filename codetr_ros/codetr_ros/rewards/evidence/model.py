@@ -183,15 +183,16 @@ class Model:
 
     def _left_out(self, sample: Sample, targets: 'Targets') -> tuple[F64, F64]:
         """Mean and variance (S,) of each level, as predicted from all other scores."""
-        data = self._linear(sample, targets)
-        if not self.link.linear:
+        if self.link.linear:
+            data, predicted = self._linear(sample, targets), self._predicted(sample)
+        else:
             f = of_steps(sample.steps(), self.posterior.mean)
-            slopes = self.link.forward(f, sample.starts, sample.m)[1]
+            predicted, slopes = self.link.forward(f, sample.starts, sample.m)
             data = self._linearised(sample, slopes, targets.levels, targets.noise)
         noises = noise(self.theta, data)
         variances = self.posterior.variances(data.rows)
         left = (1 - variances / noises).clamp_min_(LEAST_LEFT[not self.link.linear])
-        off = targets.levels - self._predicted(sample)
+        off = targets.levels - predicted
         own = noises - data.noise  # of the level itself, which a verdict is about
         mean: F64 = targets.levels - off / left.numpy()
         return mean, (variances / left + own).numpy()
