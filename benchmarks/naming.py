@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from rows import Rows
 
 import machine
 import reward_recovery
@@ -133,18 +134,10 @@ def main() -> None:
         task: reward_recovery.replay(arguments.cache / f'replay_{task}.npz', 15_000, task)
         for task in TASKS
     }
-    done = set()
-    if arguments.out.is_file():
-        with arguments.out.open() as file:
-            done = {int(row['trial']) for row in csv.DictReader(file)}
-    else:
-        arguments.out.write_text(','.join(COLUMNS) + '\n')
+    rows = Rows(arguments.out, COLUMNS, keys=1)
     for number in range(arguments.trials):
-        if number not in done:
-            line = [*trial(number, data), commit]
-            with arguments.out.open('a') as file:
-                csv.writer(file, lineterminator='\n').writerow(line)
-            print(*line, flush=True)
+        if (number,) not in rows:
+            rows.append([*trial(number, data), commit])
     write_table(arguments.out)
 
 

@@ -28,6 +28,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from rows import Rows
 
 import machine
 from codetr_ros.config import Settings, load
@@ -298,31 +299,21 @@ def main() -> None:
     torch.set_num_threads(1)
     commit = machine.commit()
     data = replay(arguments.cache)
-    done = set()
-    if arguments.out.is_file():
-        with arguments.out.open() as file:
-            done = {
-                (r['composite'], r['variant'], r['seed'], r['gradient_steps'])
-                for r in csv.DictReader(file)
-            }
-    else:
-        arguments.out.write_text(','.join(COLUMNS) + '\n')
+    rows = Rows(arguments.out, COLUMNS, keys=4)
     for steps in arguments.gradient_steps:
         for seed in arguments.seeds:
             for name in arguments.composites:
                 for variant in arguments.variants:
                     key = (name, variant, str(seed), str(steps))
-                    if key in done:
+                    if key in rows:
                         continue
                     began = time.perf_counter()
                     changes = {'composite': name, 'delay': DELAY, 'seed': seed} | VARIANTS[variant]
                     first = variant.endswith('state first')
                     row = measure(data, load('quick').changed(changes), steps, first)
                     numbers = [f'{value:.3f}' for value in row.values()]
-                    line = [*key, *numbers, f'{time.perf_counter() - began:.1f}', commit]
-                    with arguments.out.open('a') as file:
-                        csv.writer(file, lineterminator='\n').writerow(line)
-                    print(*line, flush=True)
+                    seconds = time.perf_counter() - began
+                    rows.append([*key, *numbers, f'{seconds:.1f}', commit])
     write_table(arguments.out)
 
 

@@ -25,6 +25,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from rows import Rows
 
 import machine
 import reward_recovery
@@ -134,19 +135,14 @@ def main() -> None:
     torch.set_num_threads(1)
     commit = machine.commit()
     data = reward_recovery.replay(arguments.cache)
-    done = set()
-    if arguments.out.is_file():
-        with arguments.out.open() as file:
-            done = {tuple(row[c] for c in COLUMNS[:5]) for row in csv.DictReader(file)}
-    else:
-        arguments.out.write_text(','.join(COLUMNS) + '\n')
+    rows = Rows(arguments.out, COLUMNS, keys=5)
     for name, delay, seed, kind in product(COMPOSITES, DELAYS, arguments.seeds, arguments.kinds):
         changes: dict[str, object] = {'composite': name, 'delay': delay, 'seed': seed}
         if kind.endswith('ordinal'):
             changes['evidence.score_scale'] = 'ordinal'
         for number in NUMBERS:
             key = (name, str(delay), str(number), kind, str(seed))
-            if key in done:
+            if key in rows:
                 continue
             settings = load('quick').changed(changes)
             train, held_out = reward_recovery.memories(
@@ -156,10 +152,8 @@ def main() -> None:
                 continue
             began = time.perf_counter()
             within = measure(train, held_out, changes)
-            line = [*key, f'{within:.3f}', f'{time.perf_counter() - began:.2f}', commit]
-            with arguments.out.open('a') as file:
-                csv.writer(file, lineterminator='\n').writerow(line)
-            print(*line, flush=True)
+            seconds = time.perf_counter() - began
+            rows.append([*key, f'{within:.3f}', f'{seconds:.2f}', commit])
     write_table(arguments.out)
 
 
