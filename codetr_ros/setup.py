@@ -21,6 +21,7 @@ setup(
         'codetr_ros.config.presets': ['*.yaml'],
         'codetr_ros.bags': ['msg/*.msg'],
         'codetr_ros.runs.recorded': ['*.json'],
+        'codetr_ros.pages': ['static/*', 'static/uplot/*'],
     },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),

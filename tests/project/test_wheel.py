@@ -94,8 +94,13 @@ def test_the_wheel_holds_presets_messages_and_the_mark_of_a_typed_package(wheel:
         for pattern in ('*.py', '*.yaml', 'py.typed')
         for path in source.rglob(pattern)
     }
+    static = (path for path in (source / 'pages/static').rglob('*') if path.is_file())
+    wanted |= {str(path.relative_to(PACKAGE)) for path in static}
     wanted |= {f'codetr_ros/bags/msg/{path.name}' for path in (ROOT / 'msgs' / 'msg').iterdir()}
-    for name in ('py.typed', 'config/presets/quick.yaml', 'bags/msg/Transitions.msg'):
+    for name in (
+        *('py.typed', 'config/presets/quick.yaml', 'bags/msg/Transitions.msg'),
+        *('pages/static/page.js', 'pages/static/uplot/LICENSE'),
+    ):
         assert f'codetr_ros/{name}' in wanted
     assert wanted <= names
     assert description['Version'] == VERSION
