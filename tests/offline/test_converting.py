@@ -10,12 +10,14 @@ import pytest
 from codetr_ros.bags.errors import Place
 from codetr_ros.bags.reader import Message
 from codetr_ros.config import SettingsError, validate
-from codetr_ros.offline import conversion, converting, mapping
+from codetr_ros.offline import converting
 from codetr_ros.offline.converting import Converter
 from codetr_ros.offline.errors import FitError
-from codetr_ros.offline.mapping import Mapping
-from codetr_ros.offline.message_fields import NS
 from codetr_ros.records import CompositeReward, Transitions
+from codetr_ros.robots import conversion, mapping
+from codetr_ros.robots.errors import MessageError
+from codetr_ros.robots.mapping import Mapping
+from codetr_ros.robots.message_fields import NS
 
 PLACE = Place(Path('bag'), 0)
 
@@ -332,7 +334,7 @@ def test_joints_may_be_named_by_joint_names_as_in_a_trajectory():
     point = SimpleNamespace(positions=np.array([1.0, 2.0, 3.0]))
     message = SimpleNamespace(joint_names=['a', 'x', 'b'], points=[point])
     assert mapping.numbers(message, values).tolist() == [3, 1]
-    with pytest.raises(FitError, match='/t names no joints: there is neither `name` nor'):
+    with pytest.raises(MessageError, match='/t names no joints: there is neither `name` nor'):
         mapping.numbers(SimpleNamespace(name='arm', points=[point]), values)
 
 
@@ -370,7 +372,7 @@ def test_fields_are_reached_by_dots_and_indices():
 )
 def test_a_field_that_does_not_exist_is_named_with_those_that_do(path, expected):
     message = SimpleNamespace(poses=[SimpleNamespace(x=1.0, y=2.0)], data=np.arange(3.0))
-    with pytest.raises(FitError, match=expected):
+    with pytest.raises(MessageError, match=expected):
         mapping.numbers(message, mapping.Values(topic='/p', fields=(path,)))
 
 
@@ -403,5 +405,5 @@ def test_sizes_that_change_are_refused():
 
 
 def test_a_score_that_is_no_number_is_refused():
-    with pytest.raises(FitError, match="/score: field 'data' holds no number"):
+    with pytest.raises(MessageError, match="/score: field 'data' holds no number"):
         run(rules(), *commands(1.0), said(1.1, '/score', 'good'))

@@ -10,10 +10,11 @@ from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.verify import verify
 from codetr_ros.cli import main
 from codetr_ros.config import validate
-from codetr_ros.offline import conversion, converted_bag, converting
+from codetr_ros.offline import converted_bag, converting
 from codetr_ros.offline.converted_bag import convert
-from codetr_ros.offline.mapping import Mapping
 from codetr_ros.records import CompositeReward, Transitions
+from codetr_ros.robots import conversion
+from codetr_ros.robots.mapping import Mapping
 from helpers.arm import JOINTS, NOON, NS, Sent, attempt, bag, joint_state, mcap_file, number, rules
 
 SCORES = [(first, 10, float(first + 9)) for first in (0, 10, 20, 30)]

@@ -15,12 +15,12 @@ import pytest
 from codetr_ros.bags.errors import Place
 from codetr_ros.bags.reader import Message
 from codetr_ros.config import SettingsError, validate
-from codetr_ros.offline import conversion
 from codetr_ros.offline.converting import Converter
-from codetr_ros.offline.errors import FitError
-from codetr_ros.offline.mapping import Mapping
-from codetr_ros.offline.message_fields import NS
 from codetr_ros.records import CompositeReward
+from codetr_ros.robots import conversion
+from codetr_ros.robots.errors import MessageError
+from codetr_ros.robots.mapping import Mapping
+from codetr_ros.robots.message_fields import NS
 
 STEPS = 4
 EVERY = 10.0  # [s] between the begins of two attempts
@@ -417,7 +417,9 @@ def test_a_time_may_be_a_message_nanoseconds_or_seconds(value):
 
 
 def test_a_field_that_holds_no_time_is_named():
-    with pytest.raises(FitError, match=r"/score: field 'stamp' = 'now' holds no time: name a bu"):
+    with pytest.raises(
+        MessageError, match=r"/score: field 'stamp' = 'now' holds no time: name a "
+    ):
         book({'stamp': 'stamp'}, *attempts(1), verdict(5.0, 1.0, stamp='now'))
 
 

@@ -195,7 +195,7 @@ def quoted_yaml(page: str, tmp_path: Path) -> tuple[Path, list[str]]:
 
 def test_the_spec_and_the_mapping_that_pages_show_are_accepted(tmp_path: Path):
     from codetr_ros.benchmark import spec
-    from codetr_ros.offline import mapping
+    from codetr_ros.robots import mapping
 
     assert len(spec.load(quoted_yaml('docs/benchmarks.md', tmp_path)[0]).cells) == 4 * 2 * 3
     file, more = quoted_yaml('docs/other-peoples-data.md', tmp_path)

@@ -17,7 +17,7 @@ from codetr_ros.bags.files import listed_files
 from codetr_ros.benchmark import spec
 from codetr_ros.benchmark.spec import BenchmarkError
 from codetr_ros.config import SettingsError
-from codetr_ros.offline import mapping
+from codetr_ros.robots import mapping
 from codetr_ros.runs import folder, run_summary
 from codetr_ros.runs.folder import RunFolderError
 from codetr_ros.system import parsing

@@ -28,9 +28,9 @@ from rosbags.typesys import (
 from rosbags.typesys.store import Typestore
 
 from codetr_ros.bags.errors import BagError
-from codetr_ros.bags.names import full_type_name
 from codetr_ros.records import Record, RecordError
 from codetr_ros.records.fields import RECORD_TYPES, record_of, type_name
+from codetr_ros.records.names import full_type_name
 from codetr_ros.system.parsing import brief
 
 LONGEST_DEFINITION = 1 << 20

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import yaml
 
-from codetr_ros.bags.names import full_name, full_type_name
+from codetr_ros.records.names import full_name, full_type_name
 from codetr_ros.system.parsing import ParseError, brief, read_yaml
 
 METADATA = 'metadata.yaml'

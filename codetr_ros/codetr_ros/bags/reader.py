@@ -20,13 +20,13 @@ from codetr_ros.bags.errors import BagError, Damage, Place
 from codetr_ros.bags.files import bag_files
 from codetr_ros.bags.mcap_channels import McapChannels
 from codetr_ros.bags.mcap_layout import LARGEST_RECORD, unzstd
-from codetr_ros.bags.names import full_name
 from codetr_ros.bags.opening import open_file, report
 from codetr_ros.bags.raw import Channel, OnDamage, RawMessage
 from codetr_ros.bags.time_order import OrderScan, TimeOrder
 from codetr_ros.bags.timing import Selection, Timing
 from codetr_ros.records import Record, RecordError
 from codetr_ros.records.fields import RECORD_TYPES, type_name
+from codetr_ros.records.names import full_name
 
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'  # no CDR message begins with these bytes
 _CDR = ('cdr', '')  # '': the file does not declare how its messages are serialised

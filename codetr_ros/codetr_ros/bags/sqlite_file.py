@@ -13,8 +13,8 @@ from codetr_ros.bags.definitions import Definition
 from codetr_ros.bags.errors import Damage, Place
 from codetr_ros.bags.mcap_channels import McapChannels
 from codetr_ros.bags.mcap_layout import LARGEST_RECORD
-from codetr_ros.bags.names import full_type_name
 from codetr_ros.bags.raw import Channel, OnDamage, RawMessage
+from codetr_ros.records.names import full_type_name
 
 _DAMAGED = (sqlite3.Error, UnicodeDecodeError, OverflowError)
 _FARTHEST = 1 << 40  # rows beyond a damaged one at which to look for the next

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 from codetr_ros.bags.definitions import UNREADABLE, types_of
 from codetr_ros.bags.errors import BagError
-from codetr_ros.bags.names import full_name
 from codetr_ros.bags.raw import Channel, RawMessage
+from codetr_ros.records.names import full_name
 
 _HEADER = 'std_msgs/msg/Header'
 _MOST_APART = 10 * 10**9  # [ns] between a header and its receipt, if one clock gives both

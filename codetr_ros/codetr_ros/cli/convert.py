@@ -13,6 +13,7 @@ from codetr_ros.cli.terminal import console, parse_arguments
 from codetr_ros.config import SettingsError
 from codetr_ros.offline.errors import FitError
 from codetr_ros.records import RecordError
+from codetr_ros.robots.errors import MessageError
 from codetr_ros.system.files import FileError, check_makeable
 
 
@@ -39,15 +40,15 @@ def main(arguments: Sequence[str]) -> int:
     except FileError as error:
         return refuse(f'--out {given.out}: {error}')
     from codetr_ros.bags.reader import Bag
-    from codetr_ros.offline import mapping
-    from codetr_ros.offline.conversion import HINTS, JOINTS_DOUBLED
     from codetr_ros.offline.converted_bag import LATE, OVERLAPS, convert
     from codetr_ros.offline.converting import CLOCK_BACK
+    from codetr_ros.robots import mapping
+    from codetr_ros.robots.conversion import HINTS, JOINTS_DOUBLED
 
     try:
         rules = mapping.load(Path(given.mapping))
         made = convert(Bag(Path(given.bag)), rules, Path(given.out))
-    except (BagError, FitError, RecordError, SettingsError) as error:
+    except (BagError, FitError, MessageError, RecordError, SettingsError) as error:
         return refuse(str(error))
     read = ', '.join(f'{n} of {topic}' for topic, n in sorted(made.messages.items()))
     kept = (LATE, OVERLAPS, CLOCK_BACK, JOINTS_DOUBLED)

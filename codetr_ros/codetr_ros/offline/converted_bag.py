@@ -9,12 +9,12 @@ from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.topics import BagTopic
 from codetr_ros.bags.unfinished import unfinished
 from codetr_ros.bags.writer import McapWriter
-from codetr_ros.offline.conversion import Conversion
 from codetr_ros.offline.converting import Converter, Timed
 from codetr_ros.offline.errors import FitError
-from codetr_ros.offline.mapping import Mapping
 from codetr_ros.records import TOPICS, CompositeReward, Transitions
 from codetr_ros.records.fields import type_name
+from codetr_ros.robots.conversion import Conversion
+from codetr_ros.robots.mapping import Mapping
 
 LATE = 'messages that lay behind later ones of their file, put in order of time'
 OVERLAPS = 'files that overlap in time with others, merged in order of time'

@@ -24,14 +24,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from codetr_ros.bags.reader import Message
-from codetr_ros.offline import mapping
-from codetr_ros.offline.conversion import JOINTS_DOUBLED, Conversion
-from codetr_ros.offline.doubled_joints import DoubledJoints
-from codetr_ros.offline.episode_scores import EpisodeScores
 from codetr_ros.offline.errors import FitError
-from codetr_ros.offline.mapping import Mapping
-from codetr_ros.offline.message_fields import NS, field
 from codetr_ros.records import F32, F64, MESSAGE_BYTES, CompositeReward, Transitions
+from codetr_ros.robots import mapping
+from codetr_ros.robots.conversion import JOINTS_DOUBLED, Conversion
+from codetr_ros.robots.doubled_joints import DoubledJoints
+from codetr_ros.robots.episode_scores import EpisodeScores
+from codetr_ros.robots.mapping import Mapping
+from codetr_ros.robots.message_fields import NS, field
 
 NO_OBSERVATION = 'samples without an observation within max_age'
 NOT_FINITE = 'samples that are not finite'

@@ -1,14 +1,14 @@
 """Values in messages, named by paths such as `pose.position.x` or `poses[1].y`."""
 
 import re
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from codetr_ros.bags.names import full_name
 from codetr_ros.config import Group, in_words
-from codetr_ros.offline.errors import FitError
+from codetr_ros.records.names import full_name
+from codetr_ros.robots.errors import MessageError
 
 NS = 10**9
 
@@ -30,6 +30,18 @@ FieldPath = Annotated[
 Clock = Literal['log', 'header']
 
 
+class Message(Protocol):
+    """A message of a robot's topic, received live or read from a bag."""
+
+    @property
+    def topic(self) -> str:
+        """Full name of its topic."""
+
+    @property
+    def message(self) -> Any:
+        """Its content."""
+
+
 class Timed(Group):
     """Messages of a topic."""
 
@@ -46,7 +58,7 @@ def field(message: Any, path: str, topic: str) -> Any:
     """The value of a field of a message.
 
     Raises:
-        FitError: the message has no such field or element.
+        MessageError: the message has no such field or element.
     """
     value = message
     for part in path.split('.'):
@@ -55,14 +67,14 @@ def field(message: Any, path: str, topic: str) -> Any:
         name, index = matched[1], matched[2]
         if not hasattr(value, name):
             there = [n for n in getattr(value, '__dict__', ()) if not n.startswith('_')]
-            raise FitError(
+            raise MessageError(
                 f'{topic} has no field {path!r}: there is no {name!r} in '
                 + (', '.join(there) or type(value).__name__)
             )
         value = getattr(value, name)
         if index is not None:
             if not hasattr(value, '__len__') or int(index) >= len(value):
-                raise FitError(f'{topic} has no element {path!r} in a message')
+                raise MessageError(f'{topic} has no element {path!r} in a message')
             value = value[int(index)]
     return value
 
@@ -71,7 +83,7 @@ def number(message: Any, path: str, topic: str) -> float:
     """The number in a field.
 
     Raises:
-        FitError: there is no such field, or it holds no number.
+        MessageError: there is no such field, or it holds no number.
     """
     value = field(message, path, topic)
     try:
@@ -79,7 +91,7 @@ def number(message: Any, path: str, topic: str) -> float:
     except OverflowError:
         return float('inf')
     except (TypeError, ValueError):
-        raise FitError(f'{topic}: field {path!r} holds no number') from None
+        raise MessageError(f'{topic}: field {path!r} holds no number') from None
 
 
 def moment(message: Any, path: str, topic: str) -> int:
@@ -87,7 +99,7 @@ def moment(message: Any, path: str, topic: str) -> int:
     a number of seconds with a fraction.
 
     Raises:
-        FitError: there is no such field, or it holds no time.
+        MessageError: there is no such field, or it holds no time.
     """
     value = field(message, path, topic)
     if hasattr(value, 'sec') and hasattr(value, 'nanosec'):
@@ -96,7 +108,7 @@ def moment(message: Any, path: str, topic: str) -> int:
         return int(value)
     if isinstance(value, float | np.floating) and np.isfinite(value):
         return round(float(value) * NS)
-    raise FitError(
+    raise MessageError(
         f'{topic}: field {path!r} = {value!r} holds no time: name a builtin_interfaces/Time (such '
         'as header.stamp), an integer number of nanoseconds, or a fractional number of seconds'
     )
@@ -106,7 +118,7 @@ def name_in(message: Any, path: str, topic: str) -> str:
     """The name or number in a field, as text: it is compared with that of another message.
 
     Raises:
-        FitError: there is no such field, or it holds neither a text nor numbers.
+        MessageError: there is no such field, or it holds neither a text nor numbers.
     """
     value = field(message, path, topic)
     if isinstance(value, np.ndarray | np.generic):  # an array such as the 16 bytes of a UUID
@@ -115,7 +127,7 @@ def name_in(message: Any, path: str, topic: str) -> str:
         value = int(value)
     if isinstance(value, str | int | float | list):
         return str(value)
-    raise FitError(
+    raise MessageError(
         f'{topic}: field {path!r} holds no name: it must be a text, a number or an array of '
         f'numbers, not {type(value).__name__}'
     )

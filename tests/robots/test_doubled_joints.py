@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from codetr_ros.cli import main
-from codetr_ros.offline.conversion import JOINTS_DOUBLED
-from codetr_ros.offline.doubled_joints import DoubledJoints
+from codetr_ros.robots.conversion import JOINTS_DOUBLED
+from codetr_ros.robots.doubled_joints import DoubledJoints
 from helpers.arm import JOINTS, attempt, joint_state, mcap_file, rules
 
 

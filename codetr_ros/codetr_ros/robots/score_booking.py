@@ -9,10 +9,10 @@ from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from codetr_ros.offline import conversion
-from codetr_ros.offline.message_fields import NS
-from codetr_ros.offline.score_rules import Score
-from codetr_ros.offline.scored_episode import WHOLE, ScoredEpisode, ScoredSteps
+from codetr_ros.robots import conversion
+from codetr_ros.robots.message_fields import NS
+from codetr_ros.robots.score_rules import Score
+from codetr_ros.robots.scored_episode import WHOLE, ScoredEpisode, ScoredSteps
 
 
 class Verdict(NamedTuple):

@@ -9,15 +9,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from codetr_ros.bags.reader import Message
-from codetr_ros.offline import conversion
-from codetr_ros.offline.conversion import Conversion
-from codetr_ros.offline.mapping import Mapping
-from codetr_ros.offline.message_fields import NS, moment, name_in, number
-from codetr_ros.offline.score_booking import Booking, Held, Verdict
-from codetr_ros.offline.scored_episode import ScoredEpisode
 from codetr_ros.records import CompositeReward
 from codetr_ros.records.checks import usable_score
+from codetr_ros.robots import conversion
+from codetr_ros.robots.conversion import Conversion
+from codetr_ros.robots.mapping import Mapping
+from codetr_ros.robots.message_fields import NS, Message, moment, name_in, number
+from codetr_ros.robots.score_booking import Booking, Held, Verdict
+from codetr_ros.robots.scored_episode import ScoredEpisode
 
 
 class EpisodeScores:
@@ -112,7 +111,7 @@ class EpisodeScores:
         """Name the episode that ended last, or the next one, by a message that ends episodes.
 
         Raises:
-            FitError: its field holds no name.
+            MessageError: its field holds no name.
         """
         rule = self._rules.episode
         if rule.id is None:
@@ -133,7 +132,7 @@ class EpisodeScores:
         """Take the score that a message carries, received now [ns].
 
         Raises:
-            FitError: a field that the mapping names is not there, or holds something else.
+            MessageError: a field that the mapping names is not there, or holds something else.
         """
         rule, topic, content = self._rule, message.topic, message.message
         value = number(content, rule.field, topic)

@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from codetr_ros.offline.message_fields import FieldPath, Timed
+from codetr_ros.robots.message_fields import FieldPath, Timed
 
 Of = Literal['since_last', 'last_steps', 'window', 'last_episode', 'episode']
 

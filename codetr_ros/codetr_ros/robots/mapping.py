@@ -8,10 +8,10 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from codetr_ros.config import Group, SettingsError, in_words, validate
-from codetr_ros.offline.errors import FitError
-from codetr_ros.offline.message_fields import Clock, FieldPath, Timed, Topic, field
-from codetr_ros.offline.score_rules import Score
 from codetr_ros.records import F64
+from codetr_ros.robots.errors import MessageError
+from codetr_ros.robots.message_fields import Clock, FieldPath, Timed, Topic, field
+from codetr_ros.robots.score_rules import Score
 from codetr_ros.system.parsing import ParseError, read_yaml
 
 
@@ -182,14 +182,14 @@ def joint_names(message: Any, topic: str) -> list[str]:
     """The names of the joints that the arrays of a message are of.
 
     Raises:
-        FitError: it has none.
+        MessageError: it has none.
     """
     for name in ('name', 'joint_names'):
         names = getattr(message, name, None)
         if isinstance(names, (list, tuple)):
             return list(names)
     there = [name for name in getattr(message, '__dict__', ()) if not name.startswith('_')]
-    raise FitError(
+    raise MessageError(
         f'{topic} names no joints: there is neither `name` nor `joint_names` in '
         + (', '.join(there) or type(message).__name__)
         + '. Leave out `joints`, and name elements such as data[0]'
@@ -206,7 +206,7 @@ def numbers(message: Any, values: Values) -> F64 | None:
     """The numbers of a message, in order; None if a joint is missing, or named twice.
 
     Raises:
-        FitError: a field does not exist or holds no numbers.
+        MessageError: a field does not exist or holds no numbers.
     """
     rows: list[int] | None = None
     if values.joints is not None:
@@ -220,7 +220,7 @@ def numbers(message: Any, values: Values) -> F64 | None:
         try:
             array = np.atleast_1d(np.asarray(value, np.float64)).ravel()
         except (TypeError, ValueError):
-            raise FitError(f'{values.topic}: field {path!r} holds no numbers') from None
+            raise MessageError(f'{values.topic}: field {path!r} holds no numbers') from None
         if rows is not None:
             if len(array) <= max(rows):
                 return None  # JointState leaves unknown fields empty

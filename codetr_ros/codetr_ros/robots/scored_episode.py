@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from codetr_ros.offline import conversion
+from codetr_ros.robots import conversion
 
 WHOLE = 1 << 62
 """The length of a segment that ends with its episode."""
