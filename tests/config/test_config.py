@@ -89,6 +89,22 @@ def test_an_unknown_setting_is_refused_and_the_known_ones_are_named(name: str) -
 @pytest.mark.parametrize(
     ('others', 'said'),
     [
+        ({'method': 'codetr'}, 'critic_sees_aggregate=True with method=codetr: what a segment'),
+        ({'device': 'cuda'}, 'critic_sees_aggregate=True with device=cuda: what a segment'),
+        ({'relabel_steps': 7}, 'critic_sees_aggregate=True with relabel_steps=7: what a segment'),
+    ],
+)
+def test_critics_see_only_what_one_aggregator_made(others: dict[str, Any], said: str) -> None:
+    changes = {'method': 'aggregate', 'aggregate.critic_sees_aggregate': True}
+    with pytest.raises(SettingsError) as refused:
+        config.load('quick').changed(changes | others)
+
+    assert said in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ('others', 'said'),
+    [
         ({'method': 'hc'}, 'relabel=drawn with method=hc: its policy learner draws no labelled'),
         ({'method': 'lirpg'}, 'relabel=drawn with method=lirpg: its policy learner draws no'),
         ({'device': 'cuda'}, 'relabel=drawn with device=cuda: SAC draws there from a generator'),

@@ -149,6 +149,7 @@ def test_compiled_updates_are_the_same_in_another_process(tmp_path):
     'changes',
     [
         {'relabel_steps': 100},
+        {'method': 'aggregate', 'aggregate__critic_sees_aggregate': True},
         {
             'task': PENDULUM,
             'relabel': 'drawn',

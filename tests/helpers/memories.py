@@ -90,15 +90,19 @@ def labels(
     )
 
 
-def memory(capacity: int = 1000, margin: int = 100) -> Trajectories:
-    return Trajectories(OBSERVATION, ACTION, DELAY, capacity, margin)
+def memory(capacity: int = 1000, margin: int = 100, progress: bool = False) -> Trajectories:
+    return Trajectories(OBSERVATION, ACTION, DELAY, capacity, margin, progress=progress)
 
 
 def filled(
-    seed: int = 0, sources: tuple[str, ...] = ('sim',), episodes: int = 6, capacity: int = 1000
+    seed: int = 0,
+    sources: tuple[str, ...] = ('sim',),
+    episodes: int = 6,
+    capacity: int = 1000,
+    progress: bool = False,
 ):
     """A memory and the naive one it should equal, with chunks and segments of odd sizes."""
-    naive, m = Naive(seed), memory(capacity)
+    naive, m = Naive(seed), memory(capacity, progress=progress)
     truth: dict[tuple[str, int, int], float] = {}
     for number in range(episodes):
         for source in sources:

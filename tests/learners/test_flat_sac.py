@@ -100,6 +100,23 @@ def test_in_double_precision_the_two_forms_are_one(double, hidden, observation, 
     check_close(flat, plain, 1e-9)
 
 
+@pytest.mark.parametrize(('hidden', 'observation', 'action', 'batch'), SIZES)
+def test_what_critics_alone_see_never_reaches_the_actor(
+    double, hidden, observation, action, batch
+):
+    chosen = settings(hidden, batch)
+    plain = SAC(observation, action, chosen, 3, progress=2)
+    flat = FlatSAC(observation, action, chosen, 3, progress=2)
+    for index in range(10):
+        for sac in (plain, flat):
+            torch.manual_seed(index)
+            sac.update(make_batch(batch, observation + 2, action, index))
+    check_close(flat, plain, 1e-9)
+    widths = [sac.state()['critic.0'].shape[1] for sac in (plain, flat)]
+    assert widths == [observation + 2 + action] * 2
+    assert plain.actor(torch.zeros(1, observation))[0].shape == (1, action)
+
+
 class Recorder:
     """Stands where a step of Adam would be, and keeps the gradients."""
 

@@ -153,6 +153,27 @@ def test_the_oldest_whole_episodes_leave_first_and_an_unfinished_one_stays():
     )  # the newest episode alone is too large, and is kept whole
 
 
+@pytest.mark.parametrize('sources', [('sim',), ('b', 'a')])
+def test_critics_that_see_it_get_how_far_each_steps_segment_had_come(sources):
+    m, naive, truth = filled(3, sources, episodes=9, capacity=60, progress=True)
+    known = {}
+    for (source, number), episode in naive.episodes.items():
+        steps = len(episode['actions'])
+        for t in range(steps):
+            first = t - t % DELAY
+            ended = t + 1 in (first + DELAY, steps)
+            worth = sum(float(truth[source, number, i]) for i in range(first, t + 1))
+            before = [worth - float(truth[source, number, t]), t - first]
+            after = [0.0, 0] if ended else [worth, t + 1 - first]
+            known[episode['observations'][t].tobytes()] = np.array([before, after]) / DELAY
+    batch = m.labelled.sample(np.random.default_rng(0), 2000)
+    for i in range(2000):
+        before, after = known[batch.observations[i, :O].tobytes()]
+        np.testing.assert_allclose(batch.observations[i, O:], before, atol=1e-6)
+        np.testing.assert_allclose(batch.next_observations[i, O:], after, atol=1e-6)
+    assert m.bytes_per_step == memory().bytes_per_step + 16
+
+
 def test_steps_without_a_label_are_never_sampled():
     naive, m = Naive(0), memory()
     m.append(naive.chunk('sim', 6))

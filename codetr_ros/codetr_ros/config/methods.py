@@ -168,6 +168,12 @@ class AggregateSettings(PerceptronSettings):
     """What a segment is worth so far, told by three numbers carried through it."""
 
     batch: int = Field(64, ge=1, le=65536, description='segments in a gradient step')
+    critic_sees_aggregate: bool = Field(
+        False,
+        description='the critics see, beside the observation, what the segment is worth so far '
+        'and how much of it has passed: what a step changes of a verdict depends on both. The '
+        'policy does not see them',
+    )
 
 
 class RrdSettings(PerceptronSettings):

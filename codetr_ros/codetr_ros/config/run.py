@@ -226,6 +226,21 @@ class Settings(Schedule, Delayed, Threaded, Group):
         return self
 
     @model_validator(mode='after')
+    def _critics_see_what_there_is(self) -> 'Settings':
+        if not self.aggregate.critic_sees_aggregate:
+            return self
+        wanted = {'method': 'aggregate', 'device': 'cpu', 'relabel_steps': 0}
+        for name, value in wanted.items():
+            if getattr(self, name) != value:
+                raise ValueError(
+                    f'aggregate.critic_sees_aggregate=True with {name}={getattr(self, name)}: '
+                    'what a segment is worth so far is known of whole segments, all labelled by '
+                    f'one aggregator, and only SAC on the CPU can look at it; set {name}={value} '
+                    'or aggregate.critic_sees_aggregate=False'
+                )
+        return self
+
+    @model_validator(mode='after')
     def _what_is_drawn_is_known(self) -> 'Settings':
         if self.relabel == 'all':
             return self
@@ -252,6 +267,11 @@ class Settings(Schedule, Delayed, Threaded, Group):
     def labels_steps(self) -> bool:
         """Whether a reward method labels steps, from which the policy learner learns."""
         return self.method not in SCORE_LEARNERS
+
+    @property
+    def progress(self) -> bool:
+        """Whether critics see how far a segment has come."""
+        return self.aggregate.critic_sees_aggregate
 
     @property
     def relabels_all(self) -> bool:

@@ -82,6 +82,7 @@ class Consumer(Part, ABC):
             settings.phase_steps + spec.horizon,
             self._true_rewards,
             regular=not settings.lengths.drawn,
+            progress=settings.progress,
         )
         yield from self._begin()
         for phase in range(settings.phases):

@@ -43,6 +43,7 @@ class FlatSAC(SAC):
         settings: SacSettings,
         seed: int,
         device: torch.device | str = 'cpu',
+        progress: int = 0,
     ) -> None:
         """Make the networks: the same as the plain form makes for the same arguments.
 
@@ -52,8 +53,9 @@ class FlatSAC(SAC):
             settings: widths, learning rates and the rest.
             seed: of the initial weights; torch's global generator is seeded from it.
             device: where weights, moments and sums lie; the initial weights are the same anywhere.
+            progress: numbers behind each observation of a batch, which critics alone see.
         """
-        super().__init__(observation_size, action_size, settings, seed)
+        super().__init__(observation_size, action_size, settings, seed, progress)
         freed_memory.keep()
         self.batch = settings.batch
         self.critic_adam: FlatAdam = FlatAdam(self.critic, settings.critic_learning_rate, device)
@@ -69,7 +71,7 @@ class FlatSAC(SAC):
         self._sums = torch.zeros(len(METRICS), device=device)
         self._step = self._update
         if settings.compile:
-            self._compile(self._example(observation_size, action_size))
+            self._compile(self._example(observation_size + progress, action_size))
 
     def _example(self, observation_size: int, action_size: int) -> tuple[Tensor, ...]:
         """Arguments of `_update` that lie in memory like those of every update: each in memory of
@@ -134,10 +136,10 @@ class FlatSAC(SAC):
         """One update; its metrics are added to the sums.
 
         Args:
-            s: observations (B, O).
+            s: observations (B, O), and behind them what critics alone see.
             a: actions (B, A).
             r: rewards (B,).
-            s2: next observations (B, O).
+            s2: next observations, the same.
             going_on: gamma (1 - terminated), (B,).
             noise: standard normal, (2, B, A): of the actions after s', and after s.
         """
@@ -148,7 +150,7 @@ class FlatSAC(SAC):
         alpha = self.temperature_adam.flat.exp().squeeze()
 
         # The policy's actions after s' and s, in one pass.
-        actor_hidden = forward(actor, torch.cat([s2, s])[None])
+        actor_hidden = forward(actor, self._seen(torch.cat([s2, s]))[None])
         out = torch.baddbmm(actor[-1], actor_hidden[-1], actor[-2])[0]  # (2B, 2A)
         mean, log_std = out[:, :A], out[:, A:].clamp(*LOG_STD_RANGE)
         actions, log_probs = squashed_gaussian((mean, log_std), noise.view(2 * B, A))

@@ -10,6 +10,7 @@ from codetr_ros.config import Settings
 from codetr_ros.learners.base import OffPolicy
 from codetr_ros.learners.device_sac import DeviceSAC
 from codetr_ros.learners.flat_sac import FlatSAC
+from codetr_ros.memory.ring import PROGRESS
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.policy.actor import Actor, describe_network
 
@@ -32,7 +33,10 @@ class FromLabels(OffPolicy):
 
     def _make(self, observation_size: int, action_size: int) -> FlatSAC:
         settings = self._settings
-        return FlatSAC(observation_size, action_size, settings.sac, settings.seed)
+        progress = PROGRESS if settings.progress else 0
+        return FlatSAC(
+            observation_size, action_size, settings.sac, settings.seed, progress=progress
+        )
 
     @property
     def actor(self) -> Actor:

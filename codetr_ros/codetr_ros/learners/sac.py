@@ -40,7 +40,12 @@ class SAC:
     """
 
     def __init__(
-        self, observation_size: int, action_size: int, settings: SacSettings, seed: int
+        self,
+        observation_size: int,
+        action_size: int,
+        settings: SacSettings,
+        seed: int,
+        progress: int = 0,
     ) -> None:
         """Make the networks.
 
@@ -49,12 +54,14 @@ class SAC:
             action_size: A.
             settings: widths, learning rates and the rest.
             seed: of the initial weights; torch's global generator is seeded from it.
+            progress: numbers behind each observation of a batch, which critics alone see.
         """
         seeding.seed_torch(seed, 'sac', 'init')
+        self.observation_size = observation_size
         self.discount, self.tau = settings.discount, settings.tau
         self.target_entropy = settings.target_entropy * action_size
         self.actor = Actor(observation_size, action_size, settings.hidden)
-        self.critic = twin_critic([observation_size + action_size, *settings.hidden, 1])
+        self.critic = twin_critic([observation_size + progress + action_size, *settings.hidden, 1])
         self.critic_values = [p.detach() for p in self.critic]  # the same memory, no gradients
         self.target = [p.clone() for p in self.critic_values]
         self.log_temperature = nn.Parameter(torch.tensor(math.log(settings.initial_temperature)))
@@ -79,7 +86,7 @@ class SAC:
         # Target: y = r + gamma (1 - terminated) (min_i Q'_i(s', a') - alpha log pi(a'|s')),
         # a' ~ pi(s'). An episode cut short at its horizon has not terminated: it is bootstrapped.
         with torch.no_grad():
-            a2, log_prob2 = squashed_gaussian(self.actor(s2), noise2)
+            a2, log_prob2 = squashed_gaussian(self.actor(self._seen(s2)), noise2)
             value2 = torch.minimum(*q_values(self.target, s2, a2)) - alpha * log_prob2
             y = r + self.discount * (1 - terminated.to(r.dtype)) * value2  # (B,)
 
@@ -92,7 +99,7 @@ class SAC:
         torch._foreach_lerp_(self.target, self.critic_values, self.tau)
 
         # Actor: the mean of alpha log pi(a|s) - min_i Q_i(s, a), a ~ pi(s), under the new critics.
-        a_pi, log_prob = squashed_gaussian(self.actor(s), noise)
+        a_pi, log_prob = squashed_gaussian(self.actor(self._seen(s)), noise)
         q_pi = torch.minimum(*q_values(self.critic_values, s, a_pi))
         actor_loss = (alpha * log_prob - q_pi).mean()
         self.actor_adam.step(actor_loss)
@@ -109,6 +116,10 @@ class SAC:
             'entropy': entropy,
             'q_mean': q.detach().mean(),
         }
+
+    def _seen(self, s: Tensor) -> Tensor:
+        """What the actor sees of the rows of a batch."""
+        return s[:, : self.observation_size]
 
     def state(self) -> dict[str, Tensor]:
         """All that the next update depends on except its batch and the generator: copies on the

@@ -12,10 +12,10 @@ from codetr_ros.records import F32, F64, I64
 class StepBatch:
     """Labelled steps for the policy learner; B = batch, O = observation size, A = action size."""
 
-    observations: F32  # (B, O)
+    observations: F32  # (B, O), or (B, O + 2) with what critics see of the segment's progress
     actions: F32  # (B, A)
     rewards: F32  # (B,) inferred step rewards
-    next_observations: F32  # (B, O)
+    next_observations: F32  # as wide as observations
     terminated: NDArray[np.bool_]  # (B,) true: nothing is bootstrapped from the next observation
 
 

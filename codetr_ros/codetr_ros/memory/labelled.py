@@ -4,10 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from codetr_ros.memory.batches import StepBatch
-from codetr_ros.memory.ring import ranges
+from codetr_ros.memory.ring import PROGRESS, ranges
 from codetr_ros.memory.segments import segment_ids
 from codetr_ros.memory.store import Store
-from codetr_ros.records import F32, I64, RecordError, StepRewards
+from codetr_ros.records import F32, I64, U32, RecordError, StepRewards
 
 Slots = NDArray[np.uint32] | NDArray[np.int64]
 
@@ -20,10 +20,12 @@ class LabelledSteps:
 
     Args:
         store: where the steps lie.
+        longest: steps n of the longest segment.
     """
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: Store, longest: int) -> None:
         self._store = store
+        self._longest = longest
         # (place of the source) * (rows of a source) + slot, of each labelled step
         self._slots: Slots | None = None
 
@@ -71,8 +73,26 @@ class LabelledSteps:
         slots = ranges(starts, rewards.lengths.astype(np.int64))[keep] % source.capacity
         source.labels[slots] = rewards.labels[keep]
         source.versions[slots] = rewards.version
+        if source.progress is not None:
+            source.progress[slots] = self._progress(rewards.labels, rewards.lengths)[keep]
         self.forget()
         return int(np.count_nonzero(~keep))
+
+    def _progress(self, labels: F32, lengths: U32) -> F32:
+        """How far whole segments have come before and after each of their steps: (T, 2, PROGRESS).
+
+        The worth so far is the sum of the labels so far, p(z_t), over n; the share is t / n. After
+        its last step a segment has gone back to where the next one begins: both are 0.
+        """
+        ends = np.cumsum(lengths, dtype=np.int64)
+        firsts = ends - lengths
+        sums = np.concatenate([[0.0], np.cumsum(labels, dtype=np.float64)])
+        begun = np.repeat(firsts, lengths)
+        steps = np.arange(len(labels))
+        after = np.stack([sums[steps + 1] - sums[begun], steps + 1 - begun], 1) / self._longest
+        after[ends - 1] = 0
+        before = np.roll(after, 1, axis=0)
+        return np.stack([before, after], 1).astype(np.float32)
 
     def forget(self) -> None:
         """Drop the list of labelled steps: it is made anew when it is next needed."""
@@ -121,7 +141,8 @@ class LabelledSteps:
         sources = self._store.by_name()
         if len(sources) == 1:
             return sources[0].steps_in(drawn)
-        observations = np.empty((batch, self._store.observation_size), np.float32)
+        width = self._store.observation_size + (PROGRESS if self._store.progress else 0)
+        observations = np.empty((batch, width), np.float32)
         result = StepBatch(
             observations,
             np.empty((batch, self._store.action_size), np.float32),

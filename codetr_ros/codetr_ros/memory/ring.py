@@ -11,6 +11,9 @@ from codetr_ros.memory.batches import StepBatch
 from codetr_ros.memory.table import SegmentTable
 from codetr_ros.records import F32, F64, I64, Transitions
 
+PROGRESS = 2
+"""Numbers that say how far a segment has come: its worth so far, and the share that has passed."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Rollout:
@@ -40,7 +43,13 @@ class SourceRing:
     """The steps of one source, in a ring: row r lies in slot r % capacity, rows only grow."""
 
     def __init__(
-        self, name: str, observation_size: int, action_size: int, capacity: int, true_rewards: bool
+        self,
+        name: str,
+        observation_size: int,
+        action_size: int,
+        capacity: int,
+        true_rewards: bool,
+        progress: bool = False,
     ) -> None:
         self.name = name
         self.capacity = capacity
@@ -53,6 +62,8 @@ class SourceRing:
         # the last step so far of its episode, whose next observation is in `finals`
         self.last = np.empty(capacity, np.bool_)
         self.true_rewards = np.empty(capacity, np.float32) if true_rewards else None
+        # before and after a step: what its segment is worth so far, and how much of it has passed
+        self.progress = np.empty((capacity, 2, PROGRESS), np.float32) if progress else None
         self.finals: dict[int, F32] = {}
         self.start = 0
         self.end = 0
@@ -130,8 +141,13 @@ class SourceRing:
         for i in np.flatnonzero(self.last[slots]):
             row = self.start + (int(slots[i]) - self.start) % self.capacity
             following[i] = self.finals[row]
+        observations = self.observations.take(slots, 0)
+        if self.progress is not None:
+            before, after = self.progress[slots].swapaxes(0, 1)
+            observations = np.concatenate([observations, before], 1)
+            following = np.concatenate([following, after], 1)
         return StepBatch(
-            self.observations.take(slots, 0),
+            observations,
             self.actions.take(slots, 0),
             self.labels.take(slots),
             following,

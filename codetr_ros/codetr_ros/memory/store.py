@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from codetr_ros.memory.ring import Rollout, SourceRing, StoredEpisode
+from codetr_ros.memory.ring import PROGRESS, Rollout, SourceRing, StoredEpisode
 from codetr_ros.records import F64, RecordError, Transitions, TrueRewards
 
 PART_ROWS = 1 << 16
@@ -20,6 +20,7 @@ class Store:
         capacity: steps, of all sources together, that `evict` leaves at the most.
         rows: steps that each source has room for.
         true_rewards: keep the environment's own rewards too.
+        progress: keep how far each step's segment had come.
     """
 
     def __init__(
@@ -29,12 +30,14 @@ class Store:
         capacity: int,
         rows: int,
         true_rewards: bool,
+        progress: bool = False,
     ) -> None:
         self.observation_size = observation_size
         self.action_size = action_size
         self.capacity = capacity
         self.rows = rows
         self.true_rewards = true_rewards
+        self.progress = progress
         self._sources: dict[str, SourceRing] = {}
         self._episodes = 0  # that have begun: the number of the next one in the order of age
 
@@ -56,6 +59,7 @@ class Store:
                 self.action_size,
                 self.rows,
                 self.true_rewards,
+                self.progress,
             )
         if source.steps + chunk.steps > source.capacity:
             raise RecordError(
@@ -140,7 +144,8 @@ class Store:
     def bytes_per_step(self) -> int:
         """Bytes of a row: observation, action, label, its model version, two flags."""
         per_row = 4 * self.observation_size + 4 * self.action_size + 4 + 4 + 1 + 1
-        return per_row + (4 if self.true_rewards else 0)
+        per_row += 4 if self.true_rewards else 0
+        return per_row + (2 * PROGRESS * 4 if self.progress else 0)
 
     @property
     def nbytes(self) -> int:

@@ -30,6 +30,7 @@ class Trajectories:
         regular: segments have `delay` steps and follow on each other from an episode's first step
             on, only its last is shorter. Else they may lie anywhere and have 1 to `delay` steps,
             as long as no two share a step.
+        progress: keep how far each labelled step's segment had come, for critics that see it.
     """
 
     def __init__(
@@ -41,16 +42,17 @@ class Trajectories:
         margin: int,
         true_rewards: bool = False,
         regular: bool = True,
+        progress: bool = False,
     ) -> None:
         self.observation_size = observation_size
         self.action_size = action_size
         self.delay = delay
         self.evicted = 0
         self.store = Store(
-            observation_size, action_size, capacity, capacity + margin, true_rewards
+            observation_size, action_size, capacity, capacity + margin, true_rewards, progress
         )
         self.segments = Segments(self.store, delay, regular)
-        self.labelled = LabelledSteps(self.store)
+        self.labelled = LabelledSteps(self.store, delay)
 
     def append(self, chunk: Transitions) -> None:
         """Add consecutive steps that go on where their source's last ones ended.

@@ -13,8 +13,10 @@ segment costs O(m), and m may be anything. Sums, their squares, sums of squares,
 hard maxima, minima, and peak and end are of this form, without error.
 
 Labels are what a step changes of the verdict, so they are not functions of the step alone: under a
-maximum most are 0. A critic that knows z_t beside the observation would have a Markov problem
-again; here none does.
+maximum most are 0. With `aggregate.critic_sees_aggregate` the critics see the sum of the segment's
+labels so far, p(z_{t-1}), and (t - 1) / n beside the observation. Where one of the numbers counts
+alone, what a step changes follows from these two, and the critics' problem is Markov again (our
+reading: z itself has no scale that lasts while u is learnt, and stays with the reward model).
 
 The formula beside its symbols: docs/methods.md#aggregate. All of it is decided here.
 """
