@@ -14,16 +14,12 @@ from codetr_ros.records import (
     Commit,
     CompositeReward,
     Policy,
-    Presence,
     RecordError,
     Transitions,
 )
 from codetr_ros.ros import messages
 from codetr_ros.ros.fetch import unpack
 from codetr_ros.ros.membership import Membership
-from codetr_ros.ros.patience import Patience
-from codetr_ros.ros.peers import Peers
-from codetr_ros.ros.resend import LastPhases
 from codetr_ros.ros.signals import Stop
 from codetr_ros.runs import folder as run_folder
 from helpers.builders import commit, policy, score, step_rewards, task_spec, tiny, transitions
@@ -101,7 +97,7 @@ def test_a_node_gives_up_on_what_was_lost_for_good_naming_topic_and_count(play):
 )
 def test_waiting_is_not_pointless_as_long_as(member, waiting, deadline, lost):
     member.values['peer_deadline'] = deadline
-    Patience(member, ['commits']).check(1e6, waiting, 'waits', lost)
+    member.patience(['commits']).check(1e6, waiting, 'waits', lost)
 
 
 class Core:
@@ -221,83 +217,3 @@ def test_what_the_core_has_not_taken_is_not_sent_again(play, tmp_path):
     assert report['refused'] == {'transitions': 3, 'step_rewards': 1}
     assert report['recorded']['transitions'] == 3  # of this run: one sound, two not
     assert 'step_rewards' not in report['recorded']
-
-
-def test_the_last_phases_keep_what_a_commit_names_once():
-    last = LastPhases(2)
-    last.hold(transitions(), b'a')
-    last.hold(score(), b'b')
-    last.commit(commit(scores=np.zeros(1, np.int64)), b'c')
-    assert [raw for _, raw in last.get(0)] == [b'a', b'b', b'c']
-    last.commit(commit(phase=1), b'd')
-    assert last.get(1) == [(Commit, b'd')]
-
-
-def test_a_peer_that_has_finished_was_there_so_that_a_short_run_is_not_waited_for_again():
-    settings = tiny()
-    peers = Peers('evaluate')
-    for role, count in settings.roles.items():
-        if role != 'evaluate':
-            assert count == 1
-            assert any(role in missing for missing in peers.absent(settings, 'hash'))
-            finished = presence(role, settings_hash='hash', finished=True)
-            peers.note(finished, 0.0)
-    assert peers.absent(settings, 'hash') == []
-    assert len(peers.absent(settings, 'of another run')) == 4
-
-
-@pytest.mark.parametrize(('settings_hash', 'ending'), [('hash', 'ended'), ('', 'given up')])
-def test_the_log_does_not_call_finished_what_gave_up(settings_hash, ending):
-    peers = Peers('learner')
-    assert peers.note(presence('sim', 'hash', False), 0.0) == 'sim /r/sim is there'
-    last = presence('sim', settings_hash, True)
-    assert peers.note(last, 1.0) == f'sim /r/sim has {ending}'
-
-
-def presence(role, settings_hash, finished):
-    return Presence(
-        run_id='run',
-        role=role,
-        node=f'/r/{role}',
-        instance_id=role,
-        settings_hash=settings_hash,
-        finished=finished,
-        topics=(),
-        published=np.zeros(0, np.uint64),
-        missed=0,
-    )
-
-
-def test_of_two_steps_of_the_same_number_the_first_is_sent_again():
-    last = LastPhases(2)
-    last.hold(transitions(), b'taken')
-    last.hold(transitions(), b'refused later, once the source is announced')
-    last.commit(commit(), b'commit')
-    assert [raw for _, raw in last.get(0)] == [b'taken', b'commit']
-
-
-def test_of_a_node_that_was_killed_and_started_again_only_the_newest_instance_counts():
-    peers = Peers('record')
-
-    def presence(instance, finished):
-        published = np.array([2], np.uint64)
-        return Presence(
-            run_id='run',
-            role='evaluate',
-            node='/r/evaluate',
-            instance_id=instance,
-            settings_hash='',
-            finished=finished,
-            topics=('metrics',),
-            published=published,
-            missed=0,
-        )
-
-    peers.note(presence('killed', False), 1.0)
-    assert peers.anybody_left()
-    peers.note(presence('started again', False), 2.0)
-    assert peers.anybody_left()
-    peers.note(presence('started again', True), 3.0)
-    assert not peers.anybody_left()
-    assert [peer.presence.instance_id for peer in peers.newest()] == ['started again']
-    assert peers.published() == {'metrics': 4}  # by both

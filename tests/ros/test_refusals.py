@@ -12,11 +12,11 @@ from codetr_ros.bags.errors import BagError
 from codetr_ros.config import IN_PROCESS_ONLY, SettingsError, load
 from codetr_ros.cores.core import Part
 from codetr_ros.learners.sac import SacError
+from codetr_ros.nodes import errors
 from codetr_ros.policy.acting import NetworkError
 from codetr_ros.processes import middleware
 from codetr_ros.records import RecordError
 from codetr_ros.rewards.base import RewardModelError
-from codetr_ros.ros import errors
 from codetr_ros.ros.joining import Joined
 from codetr_ros.ros.membership import Membership
 from codetr_ros.ros.node import Node

@@ -8,14 +8,13 @@ import numpy as np
 from codetr_msgs.srv import FetchPhase
 from rclpy.serialization import deserialize_message
 
+from codetr_ros.nodes.fetching import Fetching
 from codetr_ros.records import Record, RecordError
 from codetr_ros.records.fields import RECORD_TYPES
 from codetr_ros.ros import messages
 from codetr_ros.ros.link import Link
 
 SERVICE = 'fetch_phase'
-AFTER = 3.0  # [s] for messages that are still under way
-AGAIN = 5.0  # [s] until the next try
 
 
 def unpack(response: Any) -> list[Record]:
@@ -57,8 +56,7 @@ class Fetcher:
         self._run_id = run_id
         self._receive = receive
         self._client = link.node.create_client(FetchPhase, SERVICE)
-        self._missing: int | None = None
-        self._due = 0.0
+        self._fetching = Fetching()
         self.fetched = 0
 
     def check(self, missing: int | None) -> None:
@@ -67,12 +65,8 @@ class Fetcher:
         Args:
             missing: the committed phase that is incomplete, None if there is none.
         """
-        now = time.monotonic()
-        if missing != self._missing:
-            self._missing, self._due = missing, now + AFTER
-        if missing is None or now < self._due:
+        if not self._fetching.due(missing, time.monotonic()):
             return
-        self._due = now + AGAIN
         log = self._link.node.get_logger()
         if not self._client.service_is_ready():
             log.warning(

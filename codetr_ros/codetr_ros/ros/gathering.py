@@ -4,10 +4,10 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 
 from codetr_ros.config import Settings
+from codetr_ros.nodes.errors import NodeError
+from codetr_ros.nodes.patience import NAME_EVERY
 from codetr_ros.records.roles import WRITERS, published_by, readers
-from codetr_ros.ros.errors import NodeError
 from codetr_ros.ros.membership import Membership
-from codetr_ros.ros.patience import NAME_EVERY
 
 IDLE = 0.05  # [s] to block in the executor when idle: the longest that a signal waits
 

@@ -11,11 +11,11 @@ from typing import Any
 
 from codetr_ros.config import IN_PROCESS_ONLY, Settings, from_canonical, settled
 from codetr_ros.cores.core import Core
+from codetr_ros.nodes.errors import NodeError
 from codetr_ros.processes.openmp import threading_environment
 from codetr_ros.records import RunSpec
 from codetr_ros.records.roles import command
 from codetr_ros.ros import parameters
-from codetr_ros.ros.errors import NodeError
 from codetr_ros.ros.gathering import IDLE, wait_for
 from codetr_ros.ros.membership import Membership
 from codetr_ros.ros.signals import Stopped

@@ -10,6 +10,10 @@ from typing import Any
 import numpy as np
 
 from codetr_ros.cores.core import Core
+from codetr_ros.nodes.errors import NodeError
+from codetr_ros.nodes.patience import Limit, Patience
+from codetr_ros.nodes.peers import Peers
+from codetr_ros.nodes.traffic import Traffic
 from codetr_ros.records import (
     PROTOCOL_VERSION,
     TOPICS,
@@ -21,12 +25,9 @@ from codetr_ros.records import (
 )
 from codetr_ros.records.roles import published_by
 from codetr_ros.ros import given, link, messages, parameters
-from codetr_ros.ros.errors import NodeError
 from codetr_ros.ros.fetch import Fetcher
 from codetr_ros.ros.link import Link
-from codetr_ros.ros.peers import Peers
 from codetr_ros.ros.signals import Stop
-from codetr_ros.ros.traffic import Traffic
 from codetr_ros.system.files import FileError, check_makeable
 from codetr_ros.system.liveness import own_name
 
@@ -75,8 +76,7 @@ class Membership:
         self.announcement: Any = None
         self.begun = False
         self.doing = 'starting'
-        self.deadline_is = 'parameter peer_deadline (of `codetr train`: --peer-deadline)'
-        self.again = 'start the run again'
+        self.deadline_is, self.again = Limit.setting, Limit.again
         self._instance = f'{secrets.token_hex(8)} {own_name()}'.rstrip()
         self._serves = False  # the core is made from the run's settings
         self._fetcher: Fetcher | None = None
@@ -92,6 +92,11 @@ class Membership:
     def deadline(self) -> float:
         """Seconds to wait for peers; 0: for ever."""
         return float(self.values['peer_deadline'])
+
+    def patience(self, topics: Sequence[str]) -> Patience:
+        """What watches over this node while it waits for records on these topics."""
+        limit = Limit(self.deadline, self.deadline_is, self.again)
+        return Patience(self.link.full_name, self.peers, topics, limit, self.log)
 
     def introduce(self) -> None:
         """Declare the node's own parameters, and subscribe to presences and runs.

@@ -24,13 +24,13 @@ from typing import Any
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
+from codetr_ros.nodes import errors
 from codetr_ros.processes import middleware
 from codetr_ros.records import TOPICS
-from codetr_ros.ros import errors, joining, signals
+from codetr_ros.ros import joining, signals
 from codetr_ros.ros.gathering import IDLE, wait_for
 from codetr_ros.ros.joining import Joined, LoadCore
 from codetr_ros.ros.membership import Membership
-from codetr_ros.ros.patience import Patience
 from codetr_ros.ros.signals import Stop, Stopped
 from codetr_ros.ros.wiring import Wire, Wiring
 from codetr_ros.runs import folder as run_folder
@@ -97,7 +97,7 @@ class Node:
     def _work(self, wiring: Wiring) -> None:
         member, core = self.member, wiring.joined.core
         work = core.work()
-        patience = Patience(member, [TOPICS[kind] for kind in core.subscribes])
+        patience = member.patience([TOPICS[kind] for kind in core.subscribes])
         waiting: float | None = None  # since when
         worked = False  # the core has yielded something
         while not member.stop:

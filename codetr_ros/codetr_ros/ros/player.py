@@ -21,14 +21,14 @@ from rclpy.signals import SignalHandlerOptions
 
 from codetr_ros.bags.playback import Item, Pace, Playback, RecordedRun
 from codetr_ros.config import Settings
+from codetr_ros.nodes.errors import NodeError
+from codetr_ros.nodes.peers import Peer
 from codetr_ros.records import TOPICS, Commit, EpisodeResult, Metrics, RunSpec
 from codetr_ros.records.roles import WRITERS
 from codetr_ros.ros import signals
-from codetr_ros.ros.errors import NodeError
 from codetr_ros.ros.joining import Joined, join
 from codetr_ros.ros.membership import Membership
 from codetr_ros.ros.node import Node
-from codetr_ros.ros.peers import Peer
 from codetr_ros.ros.played import Cast, PlayedWiring
 from codetr_ros.ros.resend import Resender
 from codetr_ros.ros.signals import Stop

@@ -17,15 +17,15 @@ from rclpy.serialization import deserialize_message, serialize_message
 from codetr_ros.bags.first_labels import FirstLabels
 from codetr_ros.bags.topics import BagTopic
 from codetr_ros.bags.writer import McapWriter
+from codetr_ros.nodes.errors import NodeError
+from codetr_ros.nodes.patience import GRACE
 from codetr_ros.records import TOPICS, Commit, Presence, Record, RecordError, RunSpec, StepRewards
 from codetr_ros.records.checks import check_run
 from codetr_ros.records.fields import type_name
 from codetr_ros.records.roles import published_by
 from codetr_ros.ros import messages, qos
-from codetr_ros.ros.errors import NodeError
 from codetr_ros.ros.joining import Joined
 from codetr_ros.ros.membership import Membership
-from codetr_ros.ros.patience import GRACE
 from codetr_ros.ros.resend import Resender
 from codetr_ros.ros.wiring import Wiring
 from codetr_ros.runs import folder as run_folder

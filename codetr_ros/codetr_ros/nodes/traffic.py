@@ -2,11 +2,12 @@
 
 import time
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 from codetr_ros.cores.core import Core, Silent
+from codetr_ros.nodes.peers import Ledger
 from codetr_ros.records import TOPICS, Commit, Record, RecordError
-from codetr_ros.ros.peers import Ledger
 
 
 class Traffic:
@@ -22,10 +23,12 @@ class Traffic:
 
     Args:
         log: the node's logger.
+        clock: monotonic time [s].
     """
 
-    def __init__(self, log: Any) -> None:
+    def __init__(self, log: Any, clock: Callable[[], float] = time.monotonic) -> None:
         self._log = log
+        self._clock = clock
         self.core: Core[Any] = Silent()
         self.received: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
@@ -64,7 +67,7 @@ class Traffic:
         if self.lost_for_good is not None:
             return self.lost_for_good
         wanted = {TOPICS[kind] for kind in self.core.subscribes}
-        lost = self.ledger.lost(self.received + self.recovered, time.monotonic())
+        lost = self.ledger.lost(self.received + self.recovered, self._clock())
         return {topic: n for topic, n in lost.items() if topic in wanted}
 
     def counters(self) -> dict[str, dict[str, int]]:

@@ -1,32 +1,60 @@
 """When waiting is pointless: the awaited records are lost, or their publisher is gone."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
 
+from codetr_ros.nodes.errors import NodeError
+from codetr_ros.nodes.peers import Peers
 from codetr_ros.records.roles import TABLE
-from codetr_ros.ros.errors import NodeError
-from codetr_ros.ros.membership import Membership
 
 NAME_EVERY = 5.0  # [s] between two warnings about the same peers
 GRACE = 10.0  # [s] for records that a peer published before it finished
+
+
+class Warns(Protocol):
+    """A logger, of ROS or of Python."""
+
+    def warning(self, message: str) -> object:
+        """Log a warning."""
+
+
+@dataclass(frozen=True)
+class Limit:
+    """How long a node waits for others.
+
+    Attributes:
+        seconds: the deadline; 0: for ever.
+        setting: what the user sets it with, for errors.
+        again: what the user does once the obstacle is gone, for errors.
+    """
+
+    seconds: float
+    setting: str = 'parameter peer_deadline (of `codetr train`: --peer-deadline)'
+    again: str = 'start the run again'
 
 
 class Patience:
     """Watches over a node that waits during the run.
 
     Args:
-        member: the node.
+        who: the node's full name.
+        peers: the other nodes.
         topics: those on which the awaited records arrive.
+        limit: how long it waits.
+        log: logs warnings.
     """
 
-    def __init__(self, member: Membership, topics: Sequence[str]) -> None:
-        self._who = member.link.full_name
-        self._role = member.role
+    def __init__(
+        self, who: str, peers: Peers, topics: Sequence[str], limit: Limit, log: Warns
+    ) -> None:
+        self._who = who
+        self._peers = peers
         self._topics = topics
-        self._peers = member.peers
-        self._deadline = member.deadline
-        self._limit = f'{member.deadline_is}: {member.deadline:g} s'
-        self._again = member.again
-        self._log = member.log
+        self._deadline = limit.seconds
+        self._limit = f'{limit.setting}: {limit.seconds:g} s'
+        self._again = limit.again
+        self._log = log
         self._named: dict[str, float] = {}
 
     def check(self, now: float, waiting: float, doing: str, lost: Mapping[str, int]) -> None:
@@ -68,7 +96,7 @@ class Patience:
                 self._log.warning(f'{who} has been silent for {silent:.0f} s; {doing}')
 
     def _check_finished(self, now: float, waiting: float, doing: str) -> None:
-        for role in TABLE[self._role].relies_on:
+        for role in TABLE[self._peers.role].relies_on:
             gone = [peer for peer in self._peers.alive(role) if peer.presence.finished]
             all_gone = gone and len(gone) == len(self._peers.alive(role))
             patience = GRACE if all_gone else max(GRACE, self._deadline)

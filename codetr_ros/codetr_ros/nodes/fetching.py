@@ -1,0 +1,26 @@
+"""When a node asks the recorder for a committed phase again."""
+
+AFTER = 3.0  # [s] for messages that are still under way
+AGAIN = 5.0  # [s] until the next try
+
+
+class Fetching:
+    """Decides when to ask for a phase that stays incomplete."""
+
+    def __init__(self) -> None:
+        self._missing: int | None = None
+        self._due = 0.0
+
+    def due(self, missing: int | None, now: float) -> bool:
+        """Whether to ask for a phase now.
+
+        Args:
+            missing: the committed phase that is incomplete; None if there is none.
+            now: monotonic time [s].
+        """
+        if missing != self._missing:
+            self._missing, self._due = missing, now + AFTER
+        if missing is None or now < self._due:
+            return False
+        self._due = now + AGAIN
+        return True

@@ -1,0 +1,51 @@
+"""The last phases of a run, as the recorder keeps them for a node that lacks some of them."""
+
+from codetr_ros.records import Commit, CompositeReward, Record, Transitions
+
+
+class LastPhases:
+    """The received bytes of the last committed phases, and of records that no commit names yet."""
+
+    def __init__(self, phases: int) -> None:
+        self._open: dict[tuple[type, str, int], bytes] = {}
+        self._committed: dict[int, list[tuple[type, bytes]]] = {}
+        self._phases = phases
+
+    def hold(self, record: Record, raw: bytes) -> None:
+        """Keep the bytes of a record that the core has taken, until a commit names it.
+
+        The first of a number stays: steps that arrive before their source is announced are checked
+        later, so that a second one of the same number may be one that the core then refuses.
+        """
+        if isinstance(record, Transitions):
+            self._open.setdefault((Transitions, record.source, record.sequence), raw)
+        elif isinstance(record, CompositeReward):
+            self._open.setdefault((CompositeReward, record.scorer, record.sequence), raw)
+
+    def commit(self, commit: Commit, raw: bytes) -> None:
+        """File the records that a commit names under its phase; forget the oldest phase."""
+        last: dict[tuple[type, str], int] = {
+            (Transitions, s): n
+            for s, n in zip(commit.sources, commit.transitions.tolist(), strict=True)
+        }
+        last |= {
+            (CompositeReward, s): n
+            for s, n in zip(commit.scorers, commit.scores.tolist(), strict=True)
+        }
+        named = [key for key in self._open if key[2] <= last.get(key[:2], -1)]
+        self._committed[commit.phase] = [(key[0], self._open.pop(key)) for key in named] + [
+            (Commit, raw)
+        ]
+        while len(self._committed) > self._phases:
+            del self._committed[min(self._committed)]
+
+    def get(self, phase: int) -> list[tuple[type, bytes]]:
+        """Kind and bytes of each message of a committed phase.
+
+        Raises:
+            KeyError: the phase is not held; the message names those that are.
+        """
+        if phase not in self._committed:
+            held = ', '.join(map(str, sorted(self._committed))) or 'none yet'
+            raise KeyError(f'phase {phase} is not in memory; these are: {held}')
+        return self._committed[phase]

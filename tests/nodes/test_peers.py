@@ -1,0 +1,70 @@
+"""Which nodes of a run are there, have ended, or have given up."""
+
+import numpy as np
+import pytest
+
+from codetr_ros.nodes.peers import Peers
+from codetr_ros.records import Presence
+from helpers.builders import tiny
+
+
+def test_a_peer_that_has_finished_was_there_so_that_a_short_run_is_not_waited_for_again():
+    settings = tiny()
+    peers = Peers('evaluate')
+    for role, count in settings.roles.items():
+        if role != 'evaluate':
+            assert count == 1
+            assert any(role in missing for missing in peers.absent(settings, 'hash'))
+            finished = presence(role, settings_hash='hash', finished=True)
+            peers.note(finished, 0.0)
+    assert peers.absent(settings, 'hash') == []
+    assert len(peers.absent(settings, 'of another run')) == 4
+
+
+@pytest.mark.parametrize(('settings_hash', 'ending'), [('hash', 'ended'), ('', 'given up')])
+def test_the_log_does_not_call_finished_what_gave_up(settings_hash, ending):
+    peers = Peers('learner')
+    assert peers.note(presence('sim', 'hash', False), 0.0) == 'sim /r/sim is there'
+    last = presence('sim', settings_hash, True)
+    assert peers.note(last, 1.0) == f'sim /r/sim has {ending}'
+
+
+def presence(role, settings_hash, finished):
+    return Presence(
+        run_id='run',
+        role=role,
+        node=f'/r/{role}',
+        instance_id=role,
+        settings_hash=settings_hash,
+        finished=finished,
+        topics=(),
+        published=np.zeros(0, np.uint64),
+        missed=0,
+    )
+
+
+def test_of_a_node_that_was_killed_and_started_again_only_the_newest_instance_counts():
+    peers = Peers('record')
+
+    def presence(instance, finished):
+        published = np.array([2], np.uint64)
+        return Presence(
+            run_id='run',
+            role='evaluate',
+            node='/r/evaluate',
+            instance_id=instance,
+            settings_hash='',
+            finished=finished,
+            topics=('metrics',),
+            published=published,
+            missed=0,
+        )
+
+    peers.note(presence('killed', False), 1.0)
+    assert peers.anybody_left()
+    peers.note(presence('started again', False), 2.0)
+    assert peers.anybody_left()
+    peers.note(presence('started again', True), 3.0)
+    assert not peers.anybody_left()
+    assert [peer.presence.instance_id for peer in peers.newest()] == ['started again']
+    assert peers.published() == {'metrics': 4}  # by both
