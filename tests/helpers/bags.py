@@ -99,11 +99,14 @@ def topic_of(record: Record, namespace: str = '/run') -> str:
     return f'{namespace}/{TOPICS[type(record)]}'
 
 
+def own_topics(namespace: str = '/run') -> list[BagTopic]:
+    return [BagTopic(f'{namespace}/{t}', type_name(k), 10, False) for k, t in TOPICS.items()]
+
+
 def ours(folder: Path, records: Iterable[Record], namespace: str = '/run', **options) -> Path:
     """As our recorder writes it, if its chunks were small."""
     records = list(records)
-    topics = [BagTopic(f'{namespace}/{t}', type_name(k), 10, False) for k, t in TOPICS.items()]
-    writer = McapWriter(folder, topics, **({'chunk_bytes': 1500} | options))
+    writer = McapWriter(folder, own_topics(namespace), **({'chunk_bytes': 1500} | options))
     for i, record in enumerate(records):
         writer.write(topic_of(record, namespace), encode(record, 500 + i), 1000 + i, 500 + i)
     writer.close()

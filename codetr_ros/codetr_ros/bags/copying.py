@@ -62,8 +62,13 @@ class Copied:
     bytes: int = 0  # of all messages
 
 
-class _File:
-    """One file of the new bag."""
+class NewFile:
+    """One file of the new bag.
+
+    Args:
+        path: the file, which does not exist.
+        library: the writer that it names.
+    """
 
     def __init__(self, path: Path, library: str) -> None:
         self.path = path
@@ -81,6 +86,7 @@ class _File:
         self._channels: dict[Channel, int] = {}
 
     def add(self, message: RawMessage) -> None:
+        """Append a message, with its times and its number."""
         channel = message.channel
         number = self._channels.get(channel)
         if number is None:
@@ -108,11 +114,13 @@ class _File:
         return number
 
     def finish(self) -> None:
+        """Write the index, and wait until all of it is on the disk."""
         self._writer.finish()
         self._file.flush()
         os.fsync(self._file.fileno())
 
     def close(self) -> None:
+        """Close the file, whole or not."""
         self._file.close()
 
 
@@ -137,7 +145,7 @@ def copy(messages: Iterable[RawMessage], folder: Path, library: str) -> Copied:
                     file.close()
                 source = message.place.file
                 name = f'{folder.name}_{len(made.files)}.mcap'
-                file = _File(folder / name, LIBRARY if message.channel.numbered else library)
+                file = NewFile(folder / name, LIBRARY if message.channel.numbered else library)
                 stack.callback(file.close)
                 made.files.append(file.about)
             file.add(message)

@@ -17,13 +17,14 @@ import shutil
 from collections import Counter
 from collections.abc import Iterable
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import yaml
 from mcap.writer import CompressionType, Writer
 
-from codetr_ros.bags.errors import BagError, BagWriteError
+from codetr_ros.bags.errors import BagError, BagWriteError, Place
 from codetr_ros.bags.metadata import METADATA, BagFile, render
 from codetr_ros.bags.raw import LIBRARY
 from codetr_ros.bags.topics import BagTopic, schema_text, type_hash
@@ -36,15 +37,29 @@ SPLIT_BYTES = 10**9
 """Size at which the next file is begun."""
 
 
+@dataclass
+class Written:
+    """What a bag holds that is gone on with.
+
+    Attributes:
+        files: its files, in order; all have their end.
+        bytes: the size of all of them.
+    """
+
+    files: list[BagFile] = field(default_factory=list)
+    bytes: int = 0
+
+
 class McapWriter:
-    """Writes messages to a new bag.
+    """Writes messages to a new bag, or to the next file of one.
 
     Args:
-        folder: the bag; must not exist, or be empty.
+        folder: the bag; must not exist, or be empty, unless `written` is given.
         topics: that will be written.
         chunk_bytes: size at which a chunk is closed.
         split_bytes: size at which the next file is begun; 0: never.
         keep_free: `check_room` raises an error when the disk has fewer bytes left.
+        written: what the bag holds (`reopening.reopen`), to go on with it in its next file.
 
     Raises:
         BagError: the folder holds something or cannot be made, or a type is not installed.
@@ -57,25 +72,30 @@ class McapWriter:
         chunk_bytes: int = CHUNK_BYTES,
         split_bytes: int = SPLIT_BYTES,
         keep_free: int = 0,
+        written: Written | None = None,
     ) -> None:
         self.folder = folder
-        self.counts: Counter[str] = Counter()
+        written = written or Written()
+        self.counts = sum((file.counts for file in written.files), Counter[str]())
         self.closed = False
         self._topics = {topic.name: topic for topic in topics}
         self._chunk_bytes = chunk_bytes
         self._split_bytes = split_bytes
         self._keep_free = keep_free
-        self._files: list[BagFile] = []
-        self._finished = 0  # bytes of the files that are finished
+        self._files = list(written.files)
+        self._finished = written.bytes  # of the files that are finished
         self._path: Path | None = None  # of the file that is not
         self._good = 0  # bytes of it that are on the disk and whole
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            if names := sorted(path.name for path in folder.iterdir()):
+            there = sorted(path.name for path in folder.iterdir())
+            known = {METADATA, *(file.name for file in self._files)}
+            if foreign := [name for name in there if not self._files or name not in known]:
                 raise BagError(
-                    f'bag {folder} exists and holds {names[0]}: choose another folder, or remove '
-                    'it'
+                    f'bag {folder} exists and holds {foreign[0]}: choose another folder, or '
+                    'remove it'
                 )
+            (folder / METADATA).unlink(missing_ok=True)  # or it would lack the files to come
             self._open_file()
         except OSError as error:
             raise BagWriteError(
@@ -130,7 +150,7 @@ class McapWriter:
 
     def write(
         self, topic: str, data: bytes, log_time: int, publish_time: int | None = None
-    ) -> None:
+    ) -> Place:
         """Append a message.
 
         Args:
@@ -139,6 +159,9 @@ class McapWriter:
             log_time: when it was received [ns].
             publish_time: when it was published [ns]. The log time is used if it is not known, or
                 if a node states a time before 1970, which the file cannot hold.
+
+        Returns:
+            Where the chunk begins in which it will lie.
 
         Raises:
             BagError: it cannot be written. The bag is then closed, and holds what was flushed.
@@ -152,6 +175,7 @@ class McapWriter:
                 self._finish_file()
                 self._open_file()
             self._describe_again()
+            place = Place(self.folder / self._files[-1].name, self._stream.tell())
             self._writer.add_message(
                 self._channels[topic], log_time, data, publish_time, self.counts[topic]
             )
@@ -159,6 +183,7 @@ class McapWriter:
             raise self._broken(error) from error
         self.counts[topic] += 1
         self._files[-1].add(topic, log_time)
+        return place
 
     def _describe_again(self) -> None:
         """Repeat schemas and channels at the beginning of the next chunk, if it is time."""

@@ -1,0 +1,63 @@
+"""What makes two records the same one: a node that began again publishes some of them again."""
+
+from collections.abc import Callable
+from typing import Any
+
+from codetr_ros.records.kinds import (
+    Commit,
+    CompositeReward,
+    EpisodeResult,
+    Metrics,
+    Policy,
+    Presence,
+    Record,
+    RunSpec,
+    StepRewards,
+    TaskSpec,
+    Transitions,
+    TrueRewards,
+)
+
+_IDENTITY: dict[type, Callable[[Any], tuple[Any, ...]]] = {
+    RunSpec: lambda r: (r.run_id,),
+    Presence: lambda r: (r.instance_id, r.finished, tuple(r.published.tolist())),
+    TaskSpec: lambda r: (r.source,),
+    Policy: lambda r: (r.phase,),
+    Transitions: lambda r: (r.source, r.sequence),
+    CompositeReward: lambda r: (r.scorer, r.sequence),
+    Commit: lambda r: (r.phase,),
+    StepRewards: lambda r: (r.phase, r.part),
+    EpisodeResult: lambda r: (
+        r.source,
+        r.purpose,
+        r.purpose == 'training' or r.version,
+        r.episode,
+    ),
+    TrueRewards: lambda r: (r.source, r.sequence),
+    Metrics: lambda r: (r.role, r.node, r.phase, r.names),
+}
+
+
+def _version(result: EpisodeResult) -> int | None:
+    """The version that an episode evaluates; None in training, where numbers do not repeat."""
+    return None if result.purpose == 'training' else result.version
+
+
+def identity(record: Record) -> tuple[Any, ...]:
+    """What no other record of this kind has in a run, unless it is the same one again."""
+    return _IDENTITY[type(record)](record)
+
+
+def phase_of(record: Record, phase_steps: int) -> int | None:
+    """The phase that a record belongs to; None for one that belongs to none or, as a score,
+    does not name it.
+
+    Args:
+        record: the record.
+        phase_steps: environment steps of a phase.
+    """
+    if isinstance(record, EpisodeResult):
+        if record.purpose != 'training':
+            return max(0, record.version)  # it learnt from that phase
+        return max(0, record.step - 1) // phase_steps
+    return getattr(record, 'phase', None)
