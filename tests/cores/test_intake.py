@@ -160,4 +160,4 @@ def test_records_of_several_sources_enter_in_the_order_of_their_names():
     m = memory()
     zero = np.zeros(2, np.int64)
     it.receive(replace(commit(), sources=('b', 'a'), transitions=zero))
-    assert it.take(0, m) and list(m.labelled.by_source()) == ['a', 'b']
+    assert it.take(0, m) and list(m.labelled.columns()['labels']) == ['a', 'b']

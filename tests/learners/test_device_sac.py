@@ -191,7 +191,7 @@ def test_a_run_with_its_memory_on_a_device_finishes_and_its_checkpoint_loads(
     assert report.finished and report.updates > 0
     state, meta = checkpoints.load(checkpoints.latest(tmp_path / 'checkpoints', 'learner'))
     flat = FlatSAC(meta['observation_size'], meta['action_size'], chosen.sac, 1)
-    flat.load_state({name: t for name, t in state.items() if not name.startswith('labels/')})
+    flat.load_state(checkpoints.of_model(state))
     assert checkpoints.digest(flat.actor.state_dict()) == report.policy_sha256
     assert flat.state()['critic_adam.step.0'] == report.updates
 

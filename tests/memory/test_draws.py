@@ -94,7 +94,8 @@ class Watched:
         monkeypatch.setattr(draws, 'drawn', drawn)
 
     def _note(self, side: str, memory: Trajectories) -> None:
-        labels = [part.tobytes() for _, part in sorted(memory.labelled.by_source().items())]
+        by_source = memory.labelled.columns()['labels']
+        labels = [part.tobytes() for _, part in sorted(by_source.items())]
         self.memories[side].append((*labels, memory.labelled.versions().tobytes()))
 
 

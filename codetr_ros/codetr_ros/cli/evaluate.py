@@ -122,7 +122,7 @@ def newest_policy(folder: Path, settings: Settings) -> Policy:
             'its policy has learnt nothing yet'
         )
     sizes = checkpoints.sizes_of(meta, path)
-    state = {name: t for name, t in tensors.items() if not name.startswith('labels/')}
+    state = checkpoints.of_model(tensors)
     if sum(sizes) > sum(tensor.numel() for tensor in state.values()):
         raise checkpoints.CheckpointError(
             f'checkpoint {path}: observation_size = {sizes[0]} and action_size = {sizes[1]} are '

@@ -1,21 +1,31 @@
-"""The common part of learner and reward side: a memory fed by commits, checkpoints, a report."""
+"""The common part of learner and reward side: a memory fed by commits, checkpoints, a report.
 
+One that was ended goes on from its newest sound checkpoint (`resume`) and the records of the run,
+from its first phase on. It is fed them as in the run: tasks, steps, scores and commits, in order,
+no faster than it takes phases in. So whoever feeds it needs no other call than `receive`.
+"""
+
+import logging
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 
 from codetr_ros import records
 from codetr_ros.config import Settings
+from codetr_ros.cores import going_on
 from codetr_ros.cores.core import Part
 from codetr_ros.cores.intake import Intake
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import Metrics, Record, RunSpec
 from codetr_ros.runs import checkpoints
+from codetr_ros.runs.checkpoints import Checkpoint
 from codetr_ros.runs.reports import CoreReport, MemoryFacts
+
+_log = logging.getLogger(__name__)
 
 
 class Consumer(Part, ABC):
@@ -51,6 +61,8 @@ class Consumer(Part, ABC):
         self._memory: Trajectories | None = None
         self._phase = 0  # the next to be learnt from
         self._saved = -1
+        self._from: Checkpoint | None = None  # where to go on
+        self._last_metrics: dict[str, float] = {}  # as published after the last phase
         self._counters: Counter[str] = Counter()
         self.duplicated = self._intake.duplicated
         self.refused = self._intake.refused
@@ -59,6 +71,42 @@ class Consumer(Part, ABC):
     def missing(self) -> int | None:
         """A committed phase that is incomplete; None if there is none."""
         return self._intake.missing
+
+    @property
+    def phase(self) -> int:
+        """The next phase to be learnt from."""
+        return self._phase
+
+    def resume(self, newest: int | None = None) -> int:
+        """Go on from the newest sound checkpoint of this run. Call it before `work`, if at all.
+
+        `work` then takes the phases up to the checkpoint's into the memory without learning from
+        them, yields once more what was published after that phase (receivers drop what they have),
+        and goes on with the next phase, to the bit as if it had never ended. Both sides must go on
+        from the same phase, unless somebody still has all labels of the phases between.
+
+        Damaged checkpoints are logged and passed over. Those of later phases are removed: they are
+        made again.
+
+        Args:
+            newest: the highest phase to go on from; None: any.
+
+        Returns:
+            The checkpoint's phase; -1 if there is none: everything is then learnt again.
+
+        Raises:
+            CheckpointError: it is of another run or of other settings, or of an older version.
+        """
+        if self._folder is None:
+            return -1
+        for checkpoint in checkpoints.sound(self._folder, self.role, newest):
+            going_on.check(checkpoint, self._run, self._settings)
+            self._from = checkpoint
+            break
+        phase = -1 if self._from is None else self._from.phase
+        for path in checkpoints.remove_after(self._folder, self.role, phase):
+            _log.warning('removed %s: the run goes on from phase %s', path, phase)
+        return phase
 
     def receive(self, record: Record) -> None:
         """Hold a record until its phase's turn.
@@ -85,7 +133,9 @@ class Consumer(Part, ABC):
             progress=settings.progress,
         )
         yield from self._begin()
-        for phase in range(settings.phases):
+        if self._from is not None:
+            yield from self._go_on(self._from, self._memory)
+        for phase in range(self._phase, settings.phases):
             while not self._intake.take(phase, self._memory):
                 yield None
             # the phases of the warm-up are stored, and learnt from at its end
@@ -98,9 +148,34 @@ class Consumer(Part, ABC):
         while True:
             yield None
 
+    def _go_on(
+        self, checkpoint: Checkpoint, memory: Trajectories
+    ) -> Iterator[list[Record] | None]:
+        """Take in the phases up to a checkpoint's, and go on as it was when it was saved."""
+        for phase in range(checkpoint.phase + 1):
+            while not self._intake.take(phase, memory):
+                yield None
+        going_on.restore_labels(memory, checkpoint)
+        meta = checkpoint.meta
+        self._counters = going_on.counted(meta, 'counters')
+        for name, counter in (('duplicated', self.duplicated), ('refused', self.refused)):
+            counter.clear()  # others hold these very counters
+            counter.update(going_on.counted(meta, name))
+        self._last_metrics = going_on.from_text(meta[going_on.KEY]['metrics'])
+        self._saved = checkpoint.phase
+        self._phase = checkpoint.phase + 1
+        yield self._restore(checkpoint)
+        self._from = None
+
     @abstractmethod
     def _begin(self) -> Iterator[list[Record]]:
-        """Make what is trained, for sizes known now; yield the records before the first phase."""
+        """Make what is trained, for sizes known now; yield the records before the first phase,
+        unless it goes on from a checkpoint.
+        """
+
+    @abstractmethod
+    def _restore(self, checkpoint: Checkpoint) -> list[Record]:
+        """Go on as in a checkpoint; the records that were published after its phase."""
 
     @abstractmethod
     def _learn(
@@ -110,9 +185,14 @@ class Consumer(Part, ABC):
 
     @abstractmethod
     def _state(self) -> dict[str, torch.Tensor]:
-        """The tensors that a checkpoint holds."""
+        """The tensors that a checkpoint holds beside those of the memory."""
+
+    @abstractmethod
+    def _facts(self) -> dict[str, Any]:
+        """What a checkpoint holds beside tensors, for this core to go on: as JSON."""
 
     def _metrics(self, phase: int, values: Mapping[str, float]) -> Metrics:
+        self._last_metrics = dict(values)
         step = self._settings.steps_after(phase)
         return records.metrics(self._run.run_id, self.role, self._name, phase, step, values)
 
@@ -132,8 +212,16 @@ class Consumer(Part, ABC):
             'observation_size': spec.observation_size,
             'action_size': spec.action_size,
             'phase': done,
+            going_on.KEY: {
+                'counters': dict(self._counters),
+                'duplicated': dict(self.duplicated),
+                'refused': dict(self.refused),
+                'metrics': going_on.as_text(self._last_metrics),
+                **self._facts(),
+            },
         }
-        checkpoints.save(self._folder, self.role, done, self._state(), meta)
+        tensors = self._state() | going_on.memory_tensors(self._memory)
+        checkpoints.save(self._folder, self.role, done, tensors, meta)
         self._saved = done
 
     def report(self) -> CoreReport:

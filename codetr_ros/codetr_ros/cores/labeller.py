@@ -4,11 +4,13 @@ import time
 from collections import Counter
 from collections.abc import Generator, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from codetr_ros.config import Settings
+from codetr_ros.cores import going_on, published
 from codetr_ros.cores.consumer import Consumer
 from codetr_ros.memory import due
 from codetr_ros.memory.segments import Spans
@@ -26,6 +28,7 @@ from codetr_ros.records.roles import subscribed
 from codetr_ros.rewards import registry, saved
 from codetr_ros.rewards.base import ModelFacts, RewardMethod, RewardModelError
 from codetr_ros.runs import checkpoints
+from codetr_ros.runs.checkpoints import Checkpoint
 from codetr_ros.runs.reports import CoreReport, StartedFrom
 from codetr_ros.seeding import generator, seed_torch
 
@@ -71,6 +74,7 @@ class Labeller(Consumer):
         super().__init__(run, settings, name, folder, scores=True, true_rewards=oracle)
         self._method: RewardMethod | None = None
         self._fitted = False
+        self._given: list[StepRewards] = []  # published after the last phase
 
     @property
     def method(self) -> RewardMethod | None:
@@ -86,6 +90,17 @@ class Labeller(Consumer):
             else saved.restore(self._start, self._settings, *sizes)
         )
         yield []
+
+    def _restore(self, checkpoint: Checkpoint) -> list[Record]:
+        assert self._method is not None
+        self._method.load_state(checkpoints.of_model(checkpoint.tensors))
+        facts = checkpoint.meta[going_on.KEY]
+        self._fitted = bool(facts['fitted'])
+        assert self._memory is not None
+        self._given = published.again(
+            facts['given'], checkpoint, self._memory.labelled, self._run.run_id
+        )
+        return [*self._given, self._metrics(checkpoint.phase, self._last_metrics)]
 
     def _learn(
         self, phase: int, memory: Trajectories, learns: bool
@@ -117,7 +132,8 @@ class Labeller(Consumer):
             'label_seconds': time.perf_counter() - began,
         }
         self._phase = phase + 1
-        yield [*self._numbered(phase, method.version, parts), self._metrics(phase, metrics)]
+        self._given = published.numbered(self._run.run_id, phase, method.version, parts)
+        yield [*self._given, self._metrics(phase, metrics)]
 
     def _fit(
         self, phase: int, memory: Trajectories, method: RewardMethod
@@ -214,54 +230,12 @@ class Labeller(Consumer):
             memory.apply(piece)
         return pieces
 
-    def _numbered(self, phase: int, version: int, pieces: list[StepRewards]) -> list[StepRewards]:
-        """Join small pieces, source by source, into parts as large as allowed, and number them. If
-        there are none, one empty part.
-        """
-        parts: list[list[StepRewards]] = []
-        size = MESSAGE_BYTES
-        for piece in sorted(pieces, key=lambda piece: piece.source):
-            weight = len(piece.labels) * 4 + len(piece.lengths) * 12
-            if size + weight > MESSAGE_BYTES or parts[-1][0].source != piece.source:
-                parts.append([])
-                size = 0
-            parts[-1].append(piece)
-            size += weight
-        if not parts:
-            empty = np.empty(0, np.uint32)
-            nothing = np.empty(0, np.float32)
-            none = StepRewards(
-                run_id=self._run.run_id,
-                phase=phase,
-                version=version,
-                part=0,
-                parts=1,
-                source='',
-                episodes=empty,
-                first_steps=empty,
-                lengths=empty,
-                labels=nothing,
-            )
-            return [none]
-        return [
-            StepRewards(
-                run_id=self._run.run_id,
-                phase=phase,
-                version=version,
-                part=i,
-                parts=len(parts),
-                source=part[0].source,
-                episodes=np.concatenate([piece.episodes for piece in part]),
-                first_steps=np.concatenate([piece.first_steps for piece in part]),
-                lengths=np.concatenate([piece.lengths for piece in part]),
-                labels=np.concatenate([piece.labels for piece in part]),
-            )
-            for i, part in enumerate(parts)
-        ]
-
     def _state(self) -> dict[str, torch.Tensor]:
         assert self._method is not None
-        return self._method.state()
+        return self._method.state() | published.spans(self._given)
+
+    def _facts(self) -> dict[str, Any]:
+        return {'fitted': self._fitted, 'given': published.described(self._given)}
 
     def report(self) -> CoreReport:
         """Counts and the digest of the reward model, for the run's summary."""

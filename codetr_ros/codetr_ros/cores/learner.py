@@ -1,12 +1,14 @@
 """The learner's side of Algorithm 1: permit a phase, take it in, learn, permit the next."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from codetr_ros.config import Settings
+from codetr_ros.cores import going_on
 from codetr_ros.cores.consumer import Consumer
 from codetr_ros.learners import registry
 from codetr_ros.learners.base import PolicyLearner
@@ -25,6 +27,7 @@ from codetr_ros.records import (
 from codetr_ros.records.checks import check_run
 from codetr_ros.records.roles import subscribed
 from codetr_ros.runs import checkpoints
+from codetr_ros.runs.checkpoints import Checkpoint
 from codetr_ros.runs.reports import CoreReport
 from codetr_ros.system.devices import usable
 
@@ -87,8 +90,20 @@ class Learner(Consumer):
     def _begin(self) -> Iterator[list[Record]]:
         spec = self._intake.tasks.first
         self._learner = registry.make(self._settings, spec.observation_size, spec.action_size)
-        for phase in range(self._settings.lag):
-            yield [self._permit(phase, INITIAL_VERSION)]
+        if self._from is None:
+            for phase in range(self._settings.lag):
+                yield [self._permit(phase, INITIAL_VERSION)]
+
+    def _restore(self, checkpoint: Checkpoint) -> list[Record]:
+        learner, phase = self._learner, checkpoint.phase
+        assert learner is not None
+        learner.load_state(checkpoints.of_model(checkpoint.tensors))
+        learner.updates = int(checkpoint.meta[going_on.KEY]['updates'])
+        learner.counters.clear()
+        learner.counters.update(going_on.counted(checkpoint.meta, 'learner_counters'))
+        for early in [early for early in self._labels if early <= phase]:
+            del self._labels[early]
+        return self._published(phase, self._last_metrics)
 
     def _learn(
         self, phase: int, memory: Trajectories, learns: bool
@@ -113,7 +128,11 @@ class Learner(Consumer):
         }
         self._phase = phase + 1
         # permit before the checkpoint: the message travels while the checkpoint is written
-        yield [self._permit(phase + self._settings.lag, phase), self._metrics(phase, metrics)]
+        yield self._published(phase, metrics)
+
+    def _published(self, phase: int, metrics: Mapping[str, float]) -> list[Record]:
+        """What is published once a phase has been learnt from."""
+        return [self._permit(phase + self._settings.lag, phase), self._metrics(phase, metrics)]
 
     def _labelled(self, phase: int) -> bool:
         parts = self._labels.get(phase, {})
@@ -137,11 +156,14 @@ class Learner(Consumer):
 
     def _state(self) -> dict[str, torch.Tensor]:
         assert self._learner is not None
-        assert self._memory is not None
-        state = dict(self._learner.state())
-        for source, labels in self._memory.labelled.by_source().items():
-            state[f'labels/{source}'] = torch.from_numpy(labels)
-        return state
+        return dict(self._learner.state())
+
+    def _facts(self) -> dict[str, Any]:
+        assert self._learner is not None
+        return {
+            'updates': self._learner.updates,
+            'learner_counters': dict(self._learner.counters),
+        }
 
     def report(self) -> CoreReport:
         """Counts and the digest of the policy, for the run's summary."""

@@ -1,5 +1,8 @@
 """The labelled steps of the memory D: step rewards, the versions that gave them, and draws."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -94,6 +97,14 @@ class LabelledSteps:
         before = np.roll(after, 1, axis=0)
         return np.stack([before, after], 1).astype(np.float32)
 
+    def restore(self, columns: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
+        """Give all steps held the labels that `columns` had: for each name, by source."""
+        for name, by_source in columns.items():
+            for source in self._store.sources:
+                slots = np.arange(source.start, source.end) % source.capacity
+                getattr(source, name)[slots] = by_source[source.name]
+        self.forget()
+
     def forget(self) -> None:
         """Drop the list of labelled steps: it is made anew when it is next needed."""
         self._slots = None
@@ -106,12 +117,37 @@ class LabelledSteps:
         """Steps that have a step reward."""
         return len(self._places())
 
-    def by_source(self) -> dict[str, F32]:
-        """The labels of each source's steps, in order; NaN where there is none."""
+    def columns(self) -> dict[str, dict[str, NDArray[Any]]]:
+        """What is known of each source's steps (T,), in order: `labels`, NaN where there is none,
+        `versions` of the models that gave them, and `progress` where it is kept.
+        """
+        names = ('labels', 'versions', *(('progress',) if self._store.progress else ()))
+        return {name: self._by_source(name) for name in names}
+
+    def _by_source(self, name: str) -> dict[str, NDArray[Any]]:
         return {
-            source.name: source.labels[np.arange(source.start, source.end) % source.capacity]
+            source.name: getattr(source, name)[
+                np.arange(source.start, source.end) % source.capacity
+            ]
             for source in self._store.sources
         }
+
+    def of(self, name: str, episodes: U32, first_steps: U32, lengths: U32) -> F32:
+        """The labels of spans of steps that are held, one span after the other.
+
+        Args:
+            name: of their source; where there is no span it may be of none.
+            episodes: (S,).
+            first_steps: (S,) of each span, within its episode.
+            lengths: (S,) steps of each.
+        """
+        source = self._store.source(name)
+        if source is None:
+            return np.empty(0, np.float32)
+        starts = np.array([source.by_number[n].start for n in episodes.tolist()], np.int64)
+        slots = ranges(starts + first_steps, lengths.astype(np.int64)) % source.capacity
+        labels: F32 = source.labels[slots]
+        return labels
 
     def versions(self) -> I64:
         """The version of the model that gave each labelled step its label."""

@@ -90,7 +90,8 @@ def read(path: Path) -> SavedModel:
         )
     settings = from_canonical(meta['settings'], f'checkpoint {chosen}').within(horizon)
     sizes = checkpoints.sizes_of(meta, chosen)
-    return SavedModel(chosen, tensors, settings, meta['task'], sizes)
+    model = checkpoints.of_model(tensors)
+    return SavedModel(chosen, model, settings, meta['task'], sizes)
 
 
 def restore(

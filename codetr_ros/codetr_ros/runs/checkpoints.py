@@ -10,12 +10,13 @@ never silently replaced by a fresh start.
 
 import hashlib
 import json
+import logging
 import os
 import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import safetensors
@@ -25,10 +26,14 @@ import torch
 from codetr_ros.system.files import make_folder, sync_folder, write_synced
 from codetr_ros.system.parsing import brief, parse_json, shortened
 
+_log = logging.getLogger(__name__)
+
 TENSORS = 'tensors.safetensors'
 DESCRIPTION = 'checkpoint.json'
 MOST_VALUES = 1_000_000
 """The most numbers of an observation or action of a checkpoint."""
+OF_MEMORY = ('labels/', 'versions/', 'progress/', 'given/')
+"""What the names of tensors begin with that are of the memory D, not of what is trained."""
 FORMAT = 1
 """Increased whenever the layout of a checkpoint changes its meaning."""
 
@@ -37,6 +42,15 @@ class CheckpointError(ValueError):
     """A checkpoint that cannot be written or must not be read: the message names file, hashes and
     remedy.
     """
+
+
+class Checkpoint(NamedTuple):
+    """A checkpoint whose digests are right."""
+
+    path: Path
+    phase: int
+    tensors: dict[str, torch.Tensor]
+    meta: dict[str, Any]
 
 
 def digest(tensors: Mapping[str, torch.Tensor]) -> str:
@@ -222,6 +236,41 @@ def latest(folder: Path, name: str) -> Path | None:
 
 def _damaged(file: Path, actual: str, stored: str, remedy: str) -> str:
     return f'checkpoint file {file} is damaged: sha256 is {actual}, should be {stored}: {remedy}'
+
+
+def sound(folder: Path, name: str, newest: int | None = None) -> Iterator[Checkpoint]:
+    """The checkpoints of this name whose digests are right, newest first. A damaged one is logged
+    and passed over.
+
+    Args:
+        folder: the folder of the checkpoints.
+        name: the name of their owner.
+        newest: the highest phase to look at; None: any.
+    """
+    for path in reversed(_all(folder, name)):
+        if newest is not None and phase_of(path) > newest:
+            continue
+        try:
+            tensors, meta = load(path)
+        except CheckpointError as error:
+            _log.error('%s. The one before it is looked at', error)
+            continue
+        yield Checkpoint(path, phase_of(path), tensors, meta)
+
+
+def remove_after(folder: Path, name: str, phase: int) -> list[Path]:
+    """Remove the checkpoints of later phases than this one, and return what they were: a run that
+    has gone back to it makes them again.
+    """
+    later = [path for path in _all(folder, name) if phase_of(path) > phase]
+    for path in later:
+        shutil.rmtree(path)
+    return later
+
+
+def of_model(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Of a checkpoint's tensors those of what is trained, without those of the memory D."""
+    return {name: value for name, value in tensors.items() if not name.startswith(OF_MEMORY)}
 
 
 def phase_of(path: Path) -> int:
