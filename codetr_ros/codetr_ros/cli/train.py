@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from codetr_ros import config
 from codetr_ros.cli import FAILED, INTERRUPTED, refuse, results
+from codetr_ros.cli.audience import Audience
 from codetr_ros.cli.flags import parse
 from codetr_ros.cli.terminal import console
 from codetr_ros.cli.train_flags import FLAGS, PEER_DEADLINE, wrong
@@ -26,9 +27,11 @@ from codetr_ros.records import Record
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import reports as node_reports
 from codetr_ros.runs.folder import RunFolderError
+from codetr_ros.runs.live import Live, State
 from codetr_ros.runs.progress import Progress
 from codetr_ros.runs.reports import NodeReport
 from codetr_ros.runs.summary import Summary
+from codetr_ros.runs.tensorboard import Events
 from codetr_ros.system.files import atomic_write
 
 if TYPE_CHECKING:
@@ -56,6 +59,19 @@ class Topics:
     start: launcher.Start = launcher.start_program
 
 
+@dataclasses.dataclass(frozen=True)
+class Shown:
+    """What people see of a run, beside its progress and its report.
+
+    Attributes:
+        film: the robot in the report, if it can be drawn here.
+        tensorboard: events for TensorBoard.
+    """
+
+    film: bool = False
+    tensorboard: bool = False
+
+
 @dataclasses.dataclass
 class Outcome:
     """How a run ended."""
@@ -64,6 +80,13 @@ class Outcome:
     interrupted: bool = False
     failure: str | None = None
     log: Path | None = None  # explains the failure
+
+    @property
+    def state(self) -> State:
+        """How it ended, in a word."""
+        if self.failure:
+            return 'failed'
+        return 'interrupted' if self.interrupted else 'finished'
 
 
 def main(arguments: Sequence[str], start: launcher.Start = launcher.start_program) -> int:
@@ -115,7 +138,8 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
     run_id = f'r{stamp.replace("-", "_")}_{secrets.token_hex(2)}'
     topics = None if in_process else Topics(extra['namespace'], extra['peer_deadline'], start)
     command = shlex.join(['codetr', 'train', *arguments])
-    return train(settings, run_id, folder, topics, command, extra['film'])
+    shown = Shown(extra['film'], extra['tensorboard'])
+    return train(settings, run_id, folder, topics, command, shown)
 
 
 def default_out(settings: Settings, stamp: str) -> str:
@@ -130,7 +154,7 @@ def train(
     folder: Path,
     topics: Topics | None = None,
     command: str | None = None,
-    draw: bool = False,
+    shown: Shown = Shown(),
 ) -> int:
     """Do a run and write everything about it into its folder.
 
@@ -140,7 +164,7 @@ def train(
         folder: its folder, which exists.
         topics: how the nodes are started; None: run in process, without any.
         command: the command line, for the summary.
-        draw: draw the robot for the report, if it can be drawn here.
+        shown: what people see of it.
 
     Returns:
         The exit code: 0 finished, 1 failed, 2 refused, 130 interrupted.
@@ -152,6 +176,8 @@ def train(
         return refuse(str(error))
     summary = Summary(settings, run_id, topics is None, command=command)
     progress = Progress(settings)
+    namespace = topics and (topics.namespace or launcher.namespace_of(run_id))
+    live = Live(folder, summary, progress, namespace)
     progress.log(
         f'{settings.task}: {settings.composite} of {config.delay_in_words(settings.delay)}, '
         f'method {settings.method}, {settings.steps} steps, seed {settings.seed}'
@@ -160,23 +186,29 @@ def train(
     progress.log(f'output: {results.short(folder)}')
     if reason := crowded(settings.thread_count, os.getloadavg()[0]):
         progress.log(reason)
-    if topics is not None:
-        progress.log(f'namespace: {topics.namespace or launcher.namespace_of(run_id)}')
+    if namespace is not None:
+        progress.log(f'namespace: {namespace}')
+    events = None
+    if shown.tensorboard:
+        events = Events(folder / run_folder.TENSORBOARD, settings, progress.log)
+    audience = Audience(summary, progress, live, events)
     with Interrupts() as interrupts:
         with progress:
             way = _in_process if topics is None else partial(_over_topics, topics)
-            outcome = way(settings, run_id, folder, summary, progress, interrupts)
+            outcome = way(settings, run_id, folder, audience, interrupts)
         bag = folder / run_folder.BAG
         built = summary.build(
             outcome.reports, bag if bag.is_dir() else None, outcome.interrupted, outcome.failure
         )
         try:
-            draw = draw and not outcome.interrupted and not outcome.failure
+            audience.end()
+            draw = shown.film and not outcome.interrupted and not outcome.failure
             if draw:
                 progress.log('drawing the robot for the report')
             results.write(folder, summary, built, draw)
         except OSError as error:
             outcome.failure = '; '.join(filter(None, (outcome.failure, str(error))))
+    live.end(outcome.state, outcome.failure)
     results.show(built, folder, console(tables=True))
     if outcome.failure:
         show_failure(outcome)
@@ -189,27 +221,26 @@ def _in_process(
     settings: Settings,
     run_id: str,
     folder: Path,
-    summary: Summary,
-    progress: Progress,
+    audience: Audience,
     interrupts: Interrupts,
 ) -> Outcome:
     os.environ.update(threading_environment(settings))
     from codetr_ros.cores import in_process
 
-    def observe(record: Record) -> None:
-        summary.receive(record)
-        progress.receive(record)
-
     def tick() -> None:
         if interrupts.count:
             raise KeyboardInterrupt
+        audience.live.tick()
 
     # A slice may be long: a second Ctrl-C does not wait for its end.
     interrupts.raising = True
     try:
-        return Outcome(in_process.run(settings, run_id, folder, observe, tick))
+        reports = in_process.run(
+            settings, run_id, folder, audience.receive, tick, audience.live.attend
+        )
+        return Outcome(reports)
     except KeyboardInterrupt:
-        progress.log('stopped')
+        audience.progress.log('stopped')
         return Outcome(node_reports.read_all(folder), interrupted=True)
     except Exception as error:  # noqa: BLE001
         # The summary keeps what was learnt until now, and names the failure, whatever it is.
@@ -245,8 +276,7 @@ def _over_topics(
     settings: Settings,
     run_id: str,
     folder: Path,
-    summary: Summary,
-    progress: Progress,
+    audience: Audience,
     interrupts: Interrupts,
 ) -> Outcome:
     namespace = topics.namespace or launcher.namespace_of(run_id)
@@ -254,12 +284,11 @@ def _over_topics(
         settings, run_id, folder, namespace=namespace, peer_deadline=topics.peer_deadline
     )
     watch = _watcher(settings)
-    silence = Silence()
+    silence, summary, progress = Silence(), audience.summary, audience.progress
 
     def receive(record: Record) -> None:
         silence.receive(record)
-        summary.receive(record)
-        progress.receive(record)
+        audience.receive(record)
 
     failure = None
     asked = interrupts.again
@@ -270,7 +299,7 @@ def _over_topics(
 
                 def poll() -> None:
                     watcher.poll(0.1)
-                    progress.tick()
+                    audience.tick()
 
                 processes.start(commands, folder / run_folder.LOGS, launcher.environment(settings))
                 failure = supervise(

@@ -50,6 +50,13 @@ FLAGS: Sequence[tuple[str, Any, Any]] = [
         ],
         False,
     ),
+    (
+        'tensorboard',
+        Annotated[
+            bool, tyro.conf.arg(help='write events for TensorBoard into the folder tensorboard')
+        ],
+        False,
+    ),
     ('film', Annotated[bool, tyro.conf.arg(help=film.HELP)], True),
 ]
 """Name, annotated type and default of each."""

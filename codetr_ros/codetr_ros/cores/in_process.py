@@ -9,7 +9,7 @@ it.
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import torch
@@ -35,6 +35,7 @@ def run(
     folder: Path | None = None,
     observe: Callable[[Record], None] = lambda record: None,
     tick: Callable[[], None] = lambda: None,
+    attend: Callable[[Mapping[str, tuple[str, Core[Record]]]], None] = lambda cores: None,
 ) -> dict[str, NodeReport]:
     """Run Algorithm 1 to its end.
 
@@ -45,6 +46,7 @@ def run(
         observe: called with every record, in order. An error that it raises ends the run, after a
             checkpoint.
         tick: called after every slice of work; an error that it raises does the same.
+        attend: called with the parts, each with its role by its name, before they begin.
 
     Returns:
         A report for each part of the run, as the nodes write them.
@@ -68,6 +70,7 @@ def run(
     received: dict[str, Counter[str]] = {name: Counter() for name in cores}
     seconds = dict.fromkeys(cores, 0.0)
     works = {name: core.work() for name, (_, core) in cores.items()}
+    attend(cores)
     observe(spec)
     finished = False
     try:

@@ -20,6 +20,9 @@ STEP_REWARDS = 'step_rewards.csv'
 REPORT = 'report.html'
 PICTURE = 'learning_curve.png'
 FILM = 'film.png'
+STATUS = 'status.json'
+EPISODE = 'newest_episode.json'
+TENSORBOARD = 'tensorboard'
 
 
 class RunFolderError(ValueError):

@@ -28,6 +28,9 @@ FILES = (
     (run_folder.CHECKPOINTS, 'the last policies and reward models'),
     (run_folder.NODES, 'a report of each node'),
     (run_folder.LOGS, 'the output of each node'),
+    (run_folder.STATUS, 'who took part and how far the run came, as codetr watch shows it'),
+    (run_folder.EPISODE, 'the newest episode, step by step, as codetr watch shows it'),
+    (run_folder.TENSORBOARD, 'events for TensorBoard'),
 )
 """The files of a run's folder, each with what it is."""
 

@@ -86,8 +86,13 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def write_synced(path: Path, data: bytes) -> None:
+def write_synced(path: Path, data: bytes, wait: bool = True) -> None:
     """Write a file and wait until it is on the disk.
+
+    Args:
+        path: the file.
+        data: its content.
+        wait: False: do not wait for the disk.
 
     Raises:
         FileError: the disk is full or the folder cannot be written.
@@ -96,7 +101,8 @@ def write_synced(path: Path, data: bytes) -> None:
         with path.open('wb') as file:
             file.write(data)
             file.flush()
-            os.fsync(file.fileno())
+            if wait:
+                os.fsync(file.fileno())
     except OSError as error:
         raise FileError(error.errno, error.strerror, str(path)) from error
 
@@ -107,12 +113,14 @@ def _remove(partial: Path) -> None:
         partial.unlink(missing_ok=True)
 
 
-def atomic_write(path: Path, data: bytes | str) -> None:
+def atomic_write(path: Path, data: bytes | str, wait: bool = True) -> None:
     """Write a file whole or not at all: temporary name in the same folder, fsync, rename.
 
     Args:
         path: the file; an existing one is replaced.
         data: its content; text becomes UTF-8.
+        wait: False for what is soon written again: other processes see the whole old file or the
+            whole new one, and a machine that loses its power may have neither.
 
     Raises:
         OSError: the disk is full or the folder cannot be written; `path` is then unchanged.
@@ -120,7 +128,7 @@ def atomic_write(path: Path, data: bytes | str) -> None:
     content = data.encode() if isinstance(data, str) else data
     partial = path.with_name(f'.{path.name}.{os.getpid()}.partial')
     try:
-        write_synced(partial, content)
+        write_synced(partial, content, wait)
         os.replace(partial, path)
     except FileError as error:
         _remove(partial)
@@ -128,4 +136,5 @@ def atomic_write(path: Path, data: bytes | str) -> None:
     except BaseException:
         _remove(partial)
         raise
-    sync_folder(path.parent)
+    if wait:
+        sync_folder(path.parent)

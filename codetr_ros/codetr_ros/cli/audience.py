@@ -1,0 +1,44 @@
+"""Who receives the records of a run that `codetr train` does: all of it, in one place."""
+
+from dataclasses import dataclass
+
+from codetr_ros.records import Record
+from codetr_ros.runs.live import Live
+from codetr_ros.runs.progress import Progress
+from codetr_ros.runs.summary import Summary
+from codetr_ros.runs.tensorboard import Events
+
+
+@dataclass(frozen=True)
+class Audience:
+    """Receives what a run publishes.
+
+    Attributes:
+        summary: makes `summary.json` at the end.
+        progress: shows how far the run has come.
+        live: writes the files that change while the run lasts.
+        events: writes TensorBoard's events; None: nobody asked for them.
+    """
+
+    summary: Summary
+    progress: Progress
+    live: Live
+    events: Events | None = None
+
+    def receive(self, record: Record) -> None:
+        """Hand on a record."""
+        self.summary.receive(record)
+        self.progress.receive(record)
+        self.live.receive(record)
+        if self.events is not None:
+            self.events.receive(record)
+
+    def tick(self) -> None:
+        """Show what has changed, where it is time. Call it now and then."""
+        self.progress.tick()
+        self.live.tick()
+
+    def end(self) -> None:
+        """Write what is left of the events."""
+        if self.events is not None:
+            self.events.close()
