@@ -176,7 +176,7 @@ def train(
         return refuse(str(error))
     summary = Summary(settings, run_id, topics is None, command=command)
     progress = Progress(settings)
-    namespace = topics and (topics.namespace or launcher.namespace_of(run_id))
+    namespace = None if topics is None else topics.namespace or launcher.namespace_of(run_id)
     live = Live(folder, summary, progress, namespace)
     progress.log(
         f'{settings.task}: {settings.composite} of {config.delay_in_words(settings.delay)}, '
