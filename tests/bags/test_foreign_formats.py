@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from codetr_ros.bags.definitions import Definition, parsed, types_of
 from codetr_ros.bags.errors import BagError
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.recover import recover
+from codetr_ros.bags.schemas import Definition, parsed, types_of
 from codetr_ros.bags.topics import schema_text
 from codetr_ros.bags.verify import verify
 from codetr_ros.cli import main

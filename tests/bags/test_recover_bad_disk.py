@@ -54,7 +54,7 @@ def bad_disk(monkeypatch):
 def test_a_split_that_the_disk_does_not_give_costs_itself_and_the_exit_code(
     lost, tmp_path, bad_disk, capsys
 ):
-    bag = ours(tmp_path / 'bag', a_run(phases=40), split_bytes=32_000)
+    bag = ours(tmp_path / 'bag', a_run(phases=40), split_bytes=48_000)
     files = Bag(bag).files
     path = files[lost]
     whole = [(m.place.file, bytes(m.data)) for m in Bag(bag).raw()]

@@ -78,7 +78,7 @@ NAN = np.array([[0, 0, 0]] * 3 + [[0, np.nan, 0]] + [[0, 0, 0]] * 2, np.float32)
             task_spec(source='second'),
             "'second' is one simulator too many: the run has simulators=1",
         ),
-        (task_spec(protocol_version=99), "'sim' speaks protocol 99, this node 1"),
+        (task_spec(protocol_version=99), "'sim' speaks protocol 99, this node 2"),
         (task_spec(source='x', action_size=5), "'x' has action_size=5, 'sim' has 2"),
     ],
 )

@@ -14,7 +14,7 @@ from codetr_ros.bags.writer import McapWriter
 from helpers.bag_writing import COMMITS, TRANSITIONS, child, files, raw, sequences
 
 MESSAGES = 40
-SPLIT = 40_000  # several files; the definitions alone take 8 kB of each
+SPLIT = 45_000  # several files; the definitions alone take 8 kB of each
 
 
 def split_bag(folder, split_bytes=SPLIT):

@@ -44,6 +44,8 @@ EXAMPLES = {
         topics=('a', 'b'),
         published=np.array([1, 2**63], 'u8'),
         missed=2**40,
+        doing='waits for the réward node',
+        waiting=0.1,
     ),
     TaskSpec: TaskSpec(
         run_id='r',
@@ -85,6 +87,12 @@ EXAMPLES = {
         scorers=('c',),
         scores=np.array([4]),
         dropped=('d',),
+        transition_digests=('ab', 'cd'),
+        score_digests=('ef',),
+        policy_digest='01',
+        labels_digest='23',
+        kept_labels_digest='45',
+        previous='67',
     ),
     StepRewards: StepRewards(
         run_id='r',
@@ -97,6 +105,7 @@ EXAMPLES = {
         first_steps=np.array([0, 7], np.uint32),
         lengths=np.array([2, 3], np.uint32),
         labels=ODD,
+        commit='89',
     ),
     EpisodeResult: EpisodeResult(
         run_id='r',

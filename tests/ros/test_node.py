@@ -89,6 +89,21 @@ def test_a_committed_phase_is_sent_again_and_another_refused_with_the_reason(pla
     assert node.returncode == 0, said
 
 
+def test_a_node_that_waits_publishes_for_whom_and_for_how_long(play):
+    play = play(roles=('learner', 'reward'))
+    with process('record') as node:
+
+        def growing():
+            times = [m.waiting for m in play.presence_of('record') if 'waits for sim' in m.doing]
+            return times if times and times[-1] > 1 else None
+
+        times = play.until(growing, node)
+        assert times == sorted(times)
+        node.send_signal(signal.SIGTERM)
+        play.until(lambda: node.poll() is not None)
+    assert play.presence_of('record')[-1].waiting == 0, 'who has ended waits for nobody'
+
+
 def test_what_must_be_refused_is_counted_and_changes_nothing(play, tmp_path):
     play = play()
     with process('record', f'folder:={tmp_path}') as node:

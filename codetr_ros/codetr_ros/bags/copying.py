@@ -14,7 +14,7 @@ from typing import Any
 
 from mcap.writer import CompressionType, Writer
 
-from codetr_ros.bags.definitions import bundled_text
+from codetr_ros.bags.definitions import text_of
 from codetr_ros.bags.metadata import METADATA, BagFile, render
 from codetr_ros.bags.raw import LIBRARY, Channel, RawMessage
 from codetr_ros.bags.writer import CHUNK_BYTES
@@ -97,9 +97,8 @@ class NewFile:
         self.about.add(channel.topic, message.log_time)
 
     def _describe(self, channel: Channel) -> int:
-        encoding, text, digest = channel.definition
-        if not encoding and (known := bundled_text(channel.type)):
-            encoding, text = 'ros2msg', known
+        digest = channel.definition.digest
+        encoding, text = text_of(channel.type, channel.definition)
         key = channel.type, encoding, text
         if key not in self._schemas:
             self._schemas[key] = self._writer.register_schema(

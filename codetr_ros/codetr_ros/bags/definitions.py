@@ -3,54 +3,31 @@ ROS needed.
 
 A bag carries the definitions of its messages. Before a type is read, the bag's definition is
 compared with this version's, field by field: bytes read by a wrong definition would be other
-numbers.
+numbers. An older definition of ours, which lacks fields at the end, is read as it is.
 """
 
-import re
 import struct
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.interfaces import Nodetype
-from rosbags.interfaces.typing import Fielddefs, Typesdict
+from rosbags.interfaces.typing import Fielddefs
 from rosbags.serde import SerdeError
-from rosbags.typesys import (
-    Stores,
-    TypesysError,
-    get_types_from_idl,
-    get_types_from_msg,
-    get_typestore,
-)
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from codetr_ros.bags.errors import BagError
+from codetr_ros.bags.schemas import OWN, Definition, parsed
 from codetr_ros.records import Record, RecordError
 from codetr_ros.records.fields import RECORD_TYPES, record_of, type_name
-from codetr_ros.records.names import full_type_name
-from codetr_ros.system.parsing import brief
-
-LONGEST_DEFINITION = 1 << 20
-"""The most characters of a definition in a bag, with all that it contains."""
 
 _TEXTS = Path(__file__).parent / 'msg'  # the files of the message package itself
 _TIME = {'builtin_interfaces/msg/Time': 'int32 sec\nuint32 nanosec'}
 _UNREADABLE = (SerdeError, IndexError, OverflowError)
-UNREADABLE = (SerdeError, TypesysError, LookupError, OverflowError, RecursionError)
-"""What decoding a message by a definition from a bag can raise."""
-_LINE = '=' * 80  # rosbag2 puts it, and a heading, before each definition but a .msg file's first
-_HEADING = re.compile(r'(MSG|IDL): *(\S+)\s*\n')
-
-
-class Definition(NamedTuple):
-    """The definition of a message type, as a bag carries it."""
-
-    encoding: str  # 'ros2msg', 'ros2idl', or empty: the bag has none
-    text: str
-    digest: str = ''  # REP-2016 hash, where the bag has one
 
 
 def bundled_text(name: str) -> str | None:
@@ -73,45 +50,7 @@ def own_types() -> Typestore:
     return store
 
 
-def parsed(name: str, definition: Definition) -> Typesdict:
-    """The types that a bag's definition describes, the type itself among them.
-
-    Raises:
-        BagError: the definition cannot be read.
-    """
-    encoding, text = definition.encoding, definition.text
-    if encoding not in ('ros2msg', 'ros2idl'):
-        raise BagError(f'{name} is defined in {encoding!r}: only ros2msg and ros2idl are known')
-    if len(text) > LONGEST_DEFINITION:
-        raise BagError(
-            f'the definition of {name} has {len(text)} characters, '
-            f'at most {LONGEST_DEFINITION} are read'
-        )
-    try:
-        types = get_types_from_msg(text, name) if encoding == 'ros2msg' else _idl_types(text)
-    except (TypesysError, ValueError, LookupError, RecursionError) as error:
-        raise BagError(f'the definition of {name} cannot be read: {brief(error)}') from error
-    if name not in types:
-        raise BagError(f'the definition of {name} does not define it')
-    return types
-
-
-def _idl_types(text: str) -> Typesdict:
-    """The types of an IDL definition as rosbag2 writes it: each file of the type, and of the types
-    that it contains, behind a line of = and a heading, with its `#include` lines.
-    """
-    types: Typesdict = {}
-    for piece in re.split(rf'^{_LINE}=*\s*\n', text, flags=re.MULTILINE):
-        heading = _HEADING.match(piece)
-        body = piece[heading.end() :] if heading else piece
-        if heading and heading[1] == 'MSG':
-            types |= get_types_from_msg(body, full_type_name(heading[2]))
-        elif body.strip():
-            types |= get_types_from_idl(re.sub(r'^[ \t]*#.*$', '', body, flags=re.MULTILINE))
-    return types
-
-
-def _described(fields: Fielddefs) -> list[str]:
+def _described(given: Fielddefs) -> list[str]:
     def kind(node: Any) -> str:
         if node[0] == Nodetype.BASE:
             return str(node[1][0])
@@ -120,52 +59,142 @@ def _described(fields: Fielddefs) -> list[str]:
         length = node[1][1] or ''
         return f'{kind(node[1][0])}[{length}]'
 
-    return [f'{kind(node)} {name}' for name, node in fields]
+    return [f'{kind(node)} {name}' for name, node in given]
+
+
+class _Reading(NamedTuple):
+    """How messages of one of our types are read by the definition in a bag."""
+
+    store: Typestore
+    conversions: tuple[tuple[str, Callable[[Any], Any]], ...]  # of each field that it has
 
 
 def check_own(name: str, definition: Definition) -> None:
-    """Refuse a bag whose definition of one of our types differs from ours.
+    """Refuse a bag whose definition of one of our types cannot be read as ours.
+
+    An older definition lacks fields at the end, because fields are only ever appended: it is read
+    as it is, and records get the defaults of what is missing. Nothing else may differ.
 
     Raises:
         BagError: names the type, and the first field that differs.
     """
-    if text := _difference(name, definition):
-        raise BagError(f'{text}: read it with the version that wrote it')
+    _reading(name, definition)
+
+
+def is_own(name: str, definition: Definition) -> bool:
+    """Whether a bag's messages of one of our types have the bytes that this version writes.
+
+    Raises:
+        BagError: as `check_own`.
+    """
+    return _reading(name, definition).store is own_types()
+
+
+def text_of(name: str, definition: Definition) -> tuple[str, str]:
+    """Encoding and text of a type's definition: the bag's own, or for one of our types of which
+    the bag has only the hash, or nothing, ours or an older one. Both empty for any other type.
+    """
+    if definition.encoding or bundled_text(name) is None:
+        return definition.encoding, definition.text
+    store = _hashed(name, definition.digest)
+    if store is None or store is own_types():
+        return 'ros2msg', bundled_text(name) or ''
+    return 'ros2msg', store.generate_msgdef(name, ros_version=2)[0]
+
+
+def _reading(name: str, definition: Definition) -> _Reading:
+    made = _made_reading(name, definition)
+    if isinstance(made, str):
+        raise BagError(f'{made}: read it with the version that wrote it')
+    return made
 
 
 @cache
-def _difference(name: str, definition: Definition) -> str:
-    store = own_types()
+def _made_reading(name: str, definition: Definition) -> _Reading | str:
+    """How messages are read, or why they cannot be."""
     if not definition.encoding:
-        expected = store.hash_rihs01(name)
-        if definition.digest in ('', expected):
-            return ''
-        return f'{name} has the hash {definition.digest}, this version reads {expected}'
+        store = _hashed(name, definition.digest)
+        if store is None:
+            expected = own_types().hash_rihs01(name)
+            return f'{name} has the hash {definition.digest}, this version reads {expected}'
+        return _Reading(store, _conversions(name, store))
     try:
         types = parsed(name, definition)
     except BagError as error:
         return str(error)
-    for contained, (_, given) in types.items():
-        if contained not in store.fielddefs:
-            continue
-        ours, theirs = _described(store.fielddefs[contained][1]), _described(given)
-        for i in range(max(len(ours), len(theirs))):
-            here = ours[i] if i < len(ours) else 'nothing'
-            there = theirs[i] if i < len(theirs) else 'nothing'
-            if here != there:
-                return (
-                    f'{contained} is defined otherwise: field {i + 1} is {there!r} there, '
-                    f'{here!r} in this version'
-                )
+    for contained in types:
+        if text := _difference(contained, types[contained][1], older=contained == name):
+            return text
+    store = own_types()
+    if len(types[name][1]) < len(store.fielddefs[name][1]):
+        store = _cut(name, len(types[name][1]))
+    return _Reading(store, _conversions(name, store))
+
+
+def _difference(name: str, given: Fielddefs, older: bool) -> str:
+    """What differs from our definition of a type, in words; empty if nothing does.
+
+    Args:
+        name: of the type; others than ours are not compared.
+        given: its fields in the bag.
+        older: whether fields that records can do without may be missing at the end.
+    """
+    if name not in own_types().fielddefs:
+        return ''
+    ours, theirs = _described(own_types().fielddefs[name][1]), _described(given)
+    needed = _needed(name) if older else len(ours)
+    for i in range(max(needed, len(theirs))):
+        here = ours[i] if i < len(ours) else 'nothing'
+        there = theirs[i] if i < len(theirs) else 'nothing'
+        if here != there:
+            return (
+                f'{name} is defined otherwise: field {i + 1} is {there!r} there, '
+                f'{here!r} in this version'
+            )
     return ''
 
 
+def _needed(name: str) -> int:
+    """How many of the fields of a type, from the first on, every definition of it has had: those
+    that records have no default for, and what lies between them.
+    """
+    kind = RECORD_TYPES.get(name)
+    names = [field for field, _ in own_types().fielddefs[name][1]]
+    if kind is None:
+        return len(names)
+    without = [f.name for f in fields(kind) if f.default is MISSING]
+    return 1 + max(map(names.index, without), default=-1)
+
+
 @cache
-def _inward(record_type: type) -> tuple[tuple[str, Callable[[Any], Any]], ...]:
+def _hashed(name: str, digest: str) -> Typestore | None:
+    """The types of which one of ours has this hash, as it is or as it was before fields were
+    appended; those of this version where there is no hash. None if no version had it.
+    """
+    ours = own_types()
+    if digest in ('', ours.hash_rihs01(name)):
+        return ours
+    sizes = range(_needed(name), len(ours.fielddefs[name][1]))
+    older = (_cut(name, size) for size in sizes)
+    return next((store for store in older if store.hash_rihs01(name) == digest), None)
+
+
+@cache
+def _cut(name: str, size: int) -> Typestore:
+    """The types of this version, one of them with its first fields only, as it was before."""
+    constants, given = own_types().fielddefs[name]
+    store = get_typestore(Stores.EMPTY)
+    store.register({**own_types().fielddefs, name: (constants, given[:size])})
+    return store
+
+
+def _conversions(name: str, store: Typestore) -> tuple[tuple[str, Callable[[Any], Any]], ...]:
     """The conversion of each field of a decoded message for a record: arrays are copied."""
-    nodes = dict(own_types().fielddefs[type_name(record_type)][1])
+    nodes = dict(store.fielddefs[name][1])
     conversions: list[tuple[str, Callable[[Any], Any]]] = []
-    for field in fields(record_type):
+    for field in fields(RECORD_TYPES[name]):
+        if field.name not in nodes:
+            continue
         node: Any = nodes[field.name]
         element = node[1][0][1][0] if node[0] == Nodetype.SEQUENCE else None
         if element == 'string':
@@ -179,34 +208,44 @@ def _inward(record_type: type) -> tuple[tuple[str, Callable[[Any], Any]], ...]:
     return tuple(conversions)
 
 
-def decode(record_type: type, data: bytes | memoryview) -> Record:
+def decode(record_type: type, data: bytes | memoryview, definition: Definition = OWN) -> Record:
     """The record in the CDR bytes of its message.
 
     It takes no more memory than the bytes, whatever lengths they claim.
 
+    Args:
+        record_type: its kind.
+        data: the bytes.
+        definition: that of the bag, by which the bytes are read; by default that of this version.
+
     Raises:
+        BagError: the definition is neither ours nor an older one of ours.
         RecordError: the bytes are no such message, or its lengths disagree.
     """
+    name = type_name(record_type)
+    store, conversions = _reading(name, definition)
     try:
-        message = own_types().deserialize_cdr(data, type_name(record_type))
+        message = store.deserialize_cdr(data, name)
     except _UNREADABLE as error:
         raise RecordError(f'{record_type.__name__} cannot be decoded: {error}') from error
-    values = {name: inward(getattr(message, name)) for name, inward in _inward(record_type)}
+    values = {field: inward(getattr(message, field)) for field, inward in conversions}
     return record_of(record_type, values)
 
 
-def encode(record: Record, stamp: int = 0) -> bytes:
+def encode(record: Record, stamp: int = 0, definition: Definition = OWN) -> bytes:
     """The CDR bytes of a record's message.
 
     Args:
         record: the content of the message.
         stamp: when it is published [ns].
+        definition: that of the bag for which they are; by default that of this version.
 
     Raises:
+        BagError: the definition is neither ours nor an older one of ours.
         RecordError: a number does not fit its field.
     """
     name = type_name(type(record))
-    store = own_types()
+    store, _ = _reading(name, definition)
     values = [store.types['builtin_interfaces/msg/Time'](*divmod(stamp, 10**9))]
     for field, node in store.fielddefs[name][1][1:]:
         value = getattr(record, field)
@@ -222,28 +261,3 @@ def encode(record: Record, stamp: int = 0) -> bytes:
         return bytes(store.serialize_cdr(store.types[name](*values), name))
     except (SerdeError, struct.error, OverflowError) as error:
         raise RecordError(f'{type(record).__name__} cannot be written: {error}') from error
-
-
-@cache
-def types_of(name: str, definition: Definition) -> Typestore:
-    """The types to decode a message by: as the bag defines them, or as ROS 2 Jazzy does where the
-    bag has no definition.
-
-    Raises:
-        BagError: the type is not known, or its definition cannot be used.
-    """
-    if not name:
-        raise BagError('the bag does not state of what type its messages are')
-    if not definition.encoding:
-        store = get_typestore(Stores.ROS2_JAZZY)
-        if name not in store.fielddefs:
-            raise BagError(f'the bag has no definition of {name}, and ROS 2 Jazzy has none')
-        return store
-    types = parsed(name, definition)
-    store = get_typestore(Stores.EMPTY)
-    try:
-        store.register(types)
-        store.get_msgdef(name)
-    except UNREADABLE as error:
-        raise BagError(f'the definition of {name} cannot be used: {brief(error)}') from error
-    return store

@@ -6,9 +6,9 @@ from typing import Any
 
 from mcap import records as mcap_records
 
-from codetr_ros.bags.definitions import Definition
 from codetr_ros.bags.mcap_layout import FaultError
 from codetr_ros.bags.raw import LIBRARY, Channel
+from codetr_ros.bags.schemas import Definition
 from codetr_ros.records.names import full_type_name
 
 

@@ -15,6 +15,8 @@ from typing import NamedTuple
 from pydantic import Field
 
 from codetr_ros.bags.causal import causal, named, publisher
+from codetr_ros.bags.definitions import encode, is_own
+from codetr_ros.bags.older import as_now
 from codetr_ros.bags.reader import Bag
 from codetr_ros.config import Settings, SettingsError, from_canonical
 from codetr_ros.records import (
@@ -45,7 +47,7 @@ class Item(NamedTuple):
     """A message to be published."""
 
     record: Record
-    data: bytes  # as it was recorded
+    data: bytes  # as it was recorded, or as this version writes what an older one recorded
     log_time: int  # [ns] when it was received
 
 
@@ -92,7 +94,7 @@ def recorded_run(bag: Bag, run_id: str | None = None) -> RecordedRun:
     sources: dict[str, set[str]] = {}
     phases: Counter[str] = Counter()
     for entry in bag.entries({RunSpec, TaskSpec, Commit}):
-        record = entry.record
+        record = as_now(entry.record)
         if isinstance(record, RunSpec):
             runs[record.run_id] = record
         elif isinstance(record, TaskSpec):
@@ -132,7 +134,10 @@ def items(bag: Bag, run_id: str) -> Iterator[Item]:
         if entry is None or entry.kind in (RunSpec, Presence):
             continue
         if entry.record.run_id == run_id:
-            yield Item(entry.record, bytes(raw.data), entry.log_time)
+            record = as_now(entry.record)
+            same = record is entry.record and is_own(raw.channel.type, raw.channel.definition)
+            data = bytes(raw.data) if same else encode(record, entry.publish_time)
+            yield Item(record, data, entry.log_time)
 
 
 class Pace:

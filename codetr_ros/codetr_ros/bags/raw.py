@@ -3,8 +3,8 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-from codetr_ros.bags.definitions import Definition
 from codetr_ros.bags.errors import Damage, Place
+from codetr_ros.bags.schemas import Definition
 
 OnDamage = Callable[[Damage], None]
 LIBRARY = 'codetr_ros'

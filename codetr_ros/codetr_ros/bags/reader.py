@@ -15,13 +15,14 @@ from typing import Any, NamedTuple
 
 import zstandard
 
-from codetr_ros.bags.definitions import UNREADABLE, check_own, decode, types_of
+from codetr_ros.bags.definitions import decode
 from codetr_ros.bags.errors import BagError, Damage, Place
 from codetr_ros.bags.files import bag_files
 from codetr_ros.bags.mcap_channels import McapChannels
 from codetr_ros.bags.mcap_layout import LARGEST_RECORD, unzstd
 from codetr_ros.bags.opening import open_file, report
 from codetr_ros.bags.raw import Channel, OnDamage, RawMessage
+from codetr_ros.bags.schemas import UNREADABLE, types_of
 from codetr_ros.bags.time_order import OrderScan, TimeOrder
 from codetr_ros.bags.timing import Selection, Timing
 from codetr_ros.records import Record, RecordError
@@ -132,11 +133,9 @@ class Bag:
             return None
         _check_encoding(raw)
         try:
-            check_own(raw.channel.type, raw.channel.definition)
+            record = decode(kind, raw.data, raw.channel.definition)
         except BagError as error:
             raise BagError(f'{raw.place}: {error}') from None
-        try:
-            record = decode(kind, raw.data)
         except RecordError as error:
             self._damaged(raw, str(error))
             return None

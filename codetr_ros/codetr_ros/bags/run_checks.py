@@ -106,7 +106,7 @@ class RunChecks:
         digest = hashlib.sha256(record.settings.encode()).hexdigest()
         if digest != record.settings_hash:
             self._add('run', place, f'settings have the hash {digest}, not {record.settings_hash}')
-        if record.protocol_version != PROTOCOL_VERSION:
+        if not 1 <= record.protocol_version <= PROTOCOL_VERSION:
             self._add(
                 'run', place, f'protocol {record.protocol_version}, this is {PROTOCOL_VERSION}'
             )

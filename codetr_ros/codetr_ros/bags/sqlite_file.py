@@ -9,11 +9,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import quote
 
-from codetr_ros.bags.definitions import Definition
 from codetr_ros.bags.errors import Damage, Place
 from codetr_ros.bags.mcap_channels import McapChannels
 from codetr_ros.bags.mcap_layout import LARGEST_RECORD
 from codetr_ros.bags.raw import Channel, OnDamage, RawMessage
+from codetr_ros.bags.schemas import Definition
 from codetr_ros.records.names import full_type_name
 
 _DAMAGED = (sqlite3.Error, UnicodeDecodeError, OverflowError)

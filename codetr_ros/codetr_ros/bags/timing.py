@@ -5,9 +5,9 @@ from collections import Counter
 from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
-from codetr_ros.bags.definitions import UNREADABLE, types_of
 from codetr_ros.bags.errors import BagError
 from codetr_ros.bags.raw import Channel, RawMessage
+from codetr_ros.bags.schemas import UNREADABLE, types_of
 from codetr_ros.records.names import full_name
 
 _HEADER = 'std_msgs/msg/Header'

@@ -15,10 +15,11 @@ import numpy as np
 import yaml
 
 from codetr_ros.bags.copying import copy, write_metadata
-from codetr_ros.bags.definitions import Definition, encode
+from codetr_ros.bags.definitions import encode
 from codetr_ros.bags.errors import BagError
 from codetr_ros.bags.raw import LIBRARY, Channel, RawMessage
 from codetr_ros.bags.reader import Bag
+from codetr_ros.bags.schemas import Definition
 from codetr_ros.bags.topics import BagTopic, schema_text, type_hash
 from codetr_ros.bags.unfinished import unfinished
 from codetr_ros.offline.episodes import Index, Key, Stretch, stretches
@@ -111,7 +112,7 @@ def _messages(
                 last.log_time,
                 last.log_time,
                 counts[topic],
-                encode(part, last.log_time),
+                encode(part, last.log_time, channel.definition),
                 last.place,
             )
             counts[topic] += 1

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from codetr_ros.bags.causal import causal
+from codetr_ros.bags.older import as_now
 from codetr_ros.bags.reader import Bag
 from codetr_ros.config import Settings
 from codetr_ros.cores.labeller import Labeller
@@ -104,13 +105,13 @@ def fold(
             diverged.
     """
     torch.set_num_threads(settings.thread_count)
-    core = Labeller(run, settings, NODE, folder, checkpoint, frozen)
+    core = Labeller(as_now(run), settings, NODE, folder, checkpoint, frozen)
     folded = Fold(core, run, settings, 0, [], core.refused, Recorded())
     kinds = (*core.subscribes, StepRewards)
     work = core.work()
     ours = (entry for entry in bag.entries(kinds) if entry.record.run_id == run.run_id)
     for entry in causal(ours, settings.lag):
-        record = entry.record
+        record = as_now(entry.record)
         if isinstance(record, StepRewards):
             folded.recorded.recorded(record)
             continue

@@ -40,6 +40,11 @@ _PARALLEL: dict[type, tuple[tuple[str, ...], ...]] = {
 }
 """Names of arrays: each must be as long as the first of its row."""
 
+_STATED: dict[type, tuple[tuple[str, str], ...]] = {
+    Commit: (('sources', 'transition_digests'), ('scorers', 'score_digests')),
+}
+"""Names of arrays: the second is empty, or as long as the first."""
+
 
 def record_of(record_type: type, values: dict[str, Any]) -> Record:
     """The record that a message carries.
@@ -74,6 +79,9 @@ def _check_lengths(record_type: type, values: dict[str, Any]) -> None:
         for name in others:
             if len(values[name]) != len(values[first]):
                 raise _refuse(record_type, values, name, f'{len(values[first])} as {first}')
+    for first, name in _STATED.get(record_type, ()):
+        if values.get(name) and len(values[name]) != len(values[first]):
+            raise _refuse(record_type, values, name, f'{len(values[first])} as {first}, or 0')
     if record_type is StepRewards:
         steps = int(values['lengths'].sum(dtype=np.uint64))
         if len(values['labels']) != steps:

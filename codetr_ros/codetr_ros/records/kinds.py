@@ -14,8 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-PROTOCOL_VERSION = 1
-"""Raised whenever a field changes its meaning; nodes of different versions refuse each other."""
+PROTOCOL_VERSION = 2
+"""Raised whenever a field changes its meaning; nodes of different versions refuse each other.
+
+Fields are only ever appended, with a default, so that bags of older versions stay readable. Since
+version 2 commits carry digests.
+"""
 
 MESSAGE_BYTES = 200_000
 """The most bytes of a message's arrays: the middleware's shared-memory segment holds 512 KB."""
@@ -65,6 +69,8 @@ class Presence:
     topics: tuple[str, ...]
     published: U64  # (len(topics),)
     missed: int  # lost on the way to this node, all topics together
+    doing: str = ''  # what it does or waits for, for people
+    waiting: float = 0.0  # [s] for which it has waited for that; 0 while it works
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -149,6 +155,13 @@ class Commit:
     scorers: tuple[str, ...]
     scores: I64  # (len(scorers),) last sequence number of each scorer, -1 for none yet
     dropped: tuple[str, ...]  # sources left out of the phase: silent beyond the deadline
+    # digests as `records.digests` makes them; those of bags of protocol 1 are empty
+    transition_digests: tuple[str, ...] = ()  # of each source
+    score_digests: tuple[str, ...] = ()  # of each scorer
+    policy_digest: str = ''
+    labels_digest: str = ''  # of the newest phase whose labels this phase's policy was learnt with
+    kept_labels_digest: str = ''  # of what the bag keeps of these labels
+    previous: str = ''  # of the commit before
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -169,6 +182,7 @@ class StepRewards:
     first_steps: U32  # (S,)
     lengths: U32  # (S,)
     labels: F32  # (sum of lengths,) segment after segment
+    commit: str = ''  # digest of the phase's commit, of which they were made
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

@@ -31,7 +31,7 @@ def wait_for(member: Membership, lacks: Callable[[], Sequence[str]]) -> bool:
         now = time.monotonic()
         doing = f'waits for {"; ".join(lacking)}'
         if doing != member.doing:  # a node arrived: the deadline starts anew for the others
-            member.doing = doing
+            member.doing, member.waits_since = doing, now
             began = named = now
         if member.deadline and now - began > member.deadline:
             raise NodeError(

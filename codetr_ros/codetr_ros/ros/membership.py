@@ -52,6 +52,7 @@ class Membership:
         begun: whether all peers have been present; from then on, a conflict with another node or
             run is logged and ends no node.
         doing: what the node does now, for people.
+        waits_since: monotonic time [s] since which it has waited for that; None while it works.
         deadline_is: what the user sets `deadline` with, for errors.
         again: what the user does once the obstacle is gone, for errors.
 
@@ -77,6 +78,7 @@ class Membership:
         self.begun = False
         self.doing = 'starting'
         self.deadline_is, self.again = Limit.setting, Limit.again
+        self.waits_since: float | None = None
         self._instance = f'{secrets.token_hex(8)} {own_name()}'.rstrip()
         self._serves = False  # the core is made from the run's settings
         self._fetcher: Fetcher | None = None
@@ -263,6 +265,8 @@ class Membership:
                 topics=topics,
                 published=np.array([self.link.published[t] for t in topics], np.uint64),
                 missed=sum(counters['lost'].values()),
+                doing='has finished' if finished else self.doing,
+                waiting=self._waiting(finished),
             )
         )
         wrong = bool(counters['lost'] or counters['refused'])
@@ -271,6 +275,12 @@ class Membership:
             'has finished' if finished else self.doing,
             {'published': dict(self.link.published)} | counters,
         )
+
+    def _waiting(self, finished: bool) -> float:
+        """Seconds for which the node has waited; 0 while it works."""
+        if finished or self.waits_since is None:
+            return 0.0
+        return time.monotonic() - self.waits_since
 
     def close(self) -> None:
         """Take the node and its company off the graph."""

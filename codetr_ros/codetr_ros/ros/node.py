@@ -113,16 +113,16 @@ class Node:
             wiring.show(given or (), member.doing)
             if given is not None:
                 worked, waiting = True, None
-                member.doing = 'works'
+                member.doing, member.waits_since = 'works', None
                 continue
             now = time.monotonic()
             waiting = now if waiting is None else waiting
             if core.finished:
-                member.doing = 'has finished'
+                member.doing, member.waits_since = 'has finished', waiting
                 if wiring.settled(now - waiting):
                     return
             else:
-                member.doing = wiring.waits()
+                member.doing, member.waits_since = wiring.waits(), waiting
                 patience.check(now, now - waiting, member.doing, member.traffic.lost())
             member.turn(IDLE)
 
