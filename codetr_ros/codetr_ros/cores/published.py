@@ -97,7 +97,7 @@ def again(
     """
     parts = []
     for i, source in enumerate(facts['sources']):
-        rows = {
+        rows: dict[str, Any] = {
             name: checkpoint.tensors[f'{GIVEN}{i}/{name}'].numpy().view(np.uint32).copy()
             for name in _SPANS
         }
