@@ -302,3 +302,29 @@ def test_the_nearest_preset_is_that_from_which_fewest_settings_differ(preset: st
 
 def test_a_setting_that_a_preset_does_not_know_differs_from_it() -> None:
     assert config.differences({'sac': {'of_old': None}}, 'cpu') == [('sac.of_old', None, None)]
+
+
+@pytest.mark.parametrize(
+    ('changes', 'said'),
+    [
+        ({'pace': 'free'}, 'pace=free with task=Ant-v4: a simulator has no pace of its own'),
+        (
+            {'pace': 'free', 'task': 'robot/arm', 'evaluate_every': 0, 'overlap': True},
+            'overlap=True with pace=free',
+        ),
+        ({'task': 'robot/arm'}, 'evaluate_every=5000 with task=robot/arm: nothing simulates'),
+        (
+            {'task': 'robot/arm', 'evaluate_every': 0, 'simulators': 2},
+            'simulators=2 with task=robot/arm',
+        ),
+    ],
+)
+def test_only_a_robot_is_free_and_nothing_simulates_it(changes: dict[str, Any], said: str) -> None:
+    with pytest.raises(SettingsError, match=said):
+        Settings().changed(changes)  # type: ignore[call-arg]
+
+
+def test_a_free_robot_may_be_eight_phases_ahead_of_what_was_learnt_from() -> None:
+    robot = Settings().changed({'task': 'robot/arm', 'evaluate_every': 0})  # type: ignore[call-arg]
+    assert (robot.ahead, robot.lag) == (1, 1)
+    assert (robot.changed({'pace': 'free'}).ahead, robot.roles.get('evaluate')) == (8, None)

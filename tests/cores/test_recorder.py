@@ -117,3 +117,24 @@ def test_steps_that_come_before_their_announcement_are_checked_when_it_has_come(
     assert r.report().duplicated == {}
     with pytest.raises(RecordError, match='2 is the next'):
         r.receive(transitions(sequence=5))
+
+
+def test_a_phase_of_a_free_robot_is_committed_without_a_permission_once_it_is_whole():
+    r = recorder(task='robot/arm', pace='free', evaluate_every=0)
+    work = r.work()
+    r.receive(transitions(steps=199))
+    assert commits(r, work) == []
+    assert r.waiting_for() == "the rest of phase 0: 1 of 200 steps of 'sim'"
+    r.receive(transitions(sequence=1, first_step=199, steps=1, phase_end=True))
+    (made,) = commits(r, work)
+    assert (made.phase, made.transitions.tolist(), made.scorers) == (0, [1], ())
+
+
+def test_a_free_robot_may_be_phases_ahead_of_the_permission_that_arrives():
+    r = recorder(task='robot/arm', pace='free', evaluate_every=0)
+    work = r.work()
+    r.receive(transitions(steps=200, phase_end=True))
+    assert [made.phase for made in commits(r, work)] == [0]
+    r.receive(policy(phase=0))  # of a phase that is committed already
+    r.receive(transitions(sequence=1, phase=1, first_step=200, steps=200, phase_end=True))
+    assert [made.phase for made in commits(r, work)] == [1]

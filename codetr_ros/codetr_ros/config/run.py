@@ -30,7 +30,7 @@ from codetr_ros.config.methods import (
     RrdSettings,
     SacSettings,
 )
-from codetr_ros.config.schedule import Schedule
+from codetr_ros.config.schedule import ROBOT, Schedule
 from codetr_ros.config.threads import Threaded, Threads
 from codetr_ros.records import PROTOCOL_VERSION, RunSpec
 
@@ -95,6 +95,11 @@ class Settings(Schedule, Delayed, Threaded, Group):
         False,
         description='simulate phase k with the policy learnt up to phase k-2, while phase k-1 is '
         'learnt from',
+    )
+    pace: Literal['permitted', 'free'] = Field(
+        'permitted',
+        description='permitted: each phase waits for its permission; free: a robot goes on under '
+        'its newest policy while the learner learns, at most 8 phases ahead of it',
     )
     simulators: int = Field(
         1, ge=1, le=64, description='simulators that share the steps of a phase'
@@ -214,6 +219,32 @@ class Settings(Schedule, Delayed, Threaded, Group):
                 'overlap=True with method=lirpg: it learns on-policy, from steps under the very '
                 'policy that it changes; set overlap=False'
             )
+        return self
+
+    @model_validator(mode='after')
+    def _only_a_robot_is_free(self) -> 'Settings':
+        if self.free and not self.on_robot:
+            raise ValueError(
+                f'pace=free with task={self.task}: a simulator has no pace of its own; set '
+                f'pace=permitted, or the task of a robot, {ROBOT}NAME'
+            )
+        if self.free and self.overlap:
+            raise ValueError(
+                'overlap=True with pace=free: a robot at a free pace overlaps with learning '
+                'anyway; set overlap=False'
+            )
+        return self
+
+    @model_validator(mode='after')
+    def _a_robot_is_not_evaluated_in_simulation(self) -> 'Settings':
+        if not self.on_robot:
+            return self
+        for name, due in (('evaluate_every', 0), ('simulators', 1), ('envs', 1)):
+            if getattr(self, name) != due:
+                raise ValueError(
+                    f'{name}={getattr(self, name)} with task={self.task}: nothing simulates the '
+                    f'steps of a robot, and there is one of it; set {name}={due}'
+                )
         return self
 
     @model_validator(mode='after')

@@ -4,11 +4,19 @@ from typing import TYPE_CHECKING
 
 from codetr_ros.records import roles
 
+ROBOT = 'robot/'
+"""What the name of a task begins with that is no simulation but somebody's robot."""
+
+FREE_AHEAD = 8
+"""Phases by which a robot at a free pace may be ahead of what has been learnt from."""
+
 
 class Schedule:
     """The arithmetic of a run, mixed into its settings."""
 
     if TYPE_CHECKING:  # fields of `Settings`; with annotations at run time they would come first
+        task: str
+        pace: str
         steps: int
         phase_steps: int
         warmup_steps: int
@@ -35,6 +43,21 @@ class Schedule:
     def lag(self) -> int:
         """Phases between learning a policy and acting under it: 1 in lock-step, 2 with overlap."""
         return 2 if self.overlap else 1
+
+    @property
+    def free(self) -> bool:
+        """Whether the source waits for no permission."""
+        return self.pace == 'free'
+
+    @property
+    def on_robot(self) -> bool:
+        """Whether the steps are those of a robot, not of a simulation."""
+        return self.task.startswith(ROBOT)
+
+    @property
+    def ahead(self) -> int:
+        """Phases by which a source may be ahead of the newest that was learnt from."""
+        return FREE_AHEAD if self.free else self.lag
 
     def steps_of(self, phase: int) -> int:
         """Environment steps of a phase, all sources together; 0 beyond the last."""

@@ -86,7 +86,7 @@ class Intake:
         key: tuple[str, int],
         taken: 'Counter[str]',
     ) -> None:
-        ahead = (self._settings.lag + 1) * self._settings.phase_steps
+        ahead = (self._settings.ahead + 1) * self._settings.phase_steps
         if key[1] >= taken[key[0]] + ahead:
             raise RecordError(
                 f'{describe(record)} is out of sequence: the permitted phases hold fewer than '

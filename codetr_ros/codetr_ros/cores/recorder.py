@@ -68,6 +68,8 @@ class Recorder(Part):
         if isinstance(record, TaskSpec):
             self._tasks.announce(record, self.receive)
         elif isinstance(record, Policy):
+            if self._settings.free:
+                return  # nothing waits for a permission
             due, given = self._settings.steps_of(record.phase), int(record.steps.sum())
             if record.phase < self.phase or given != due:
                 raise RecordError(
@@ -115,8 +117,16 @@ class Recorder(Part):
         while True:
             yield None
 
+    def _members(self, phase: int) -> dict[str, int]:
+        """Steps of a phase by source; none as long as they are not known."""
+        if not self._settings.free:
+            return self._permitted.get(phase, {})
+        if not self._tasks.known:
+            return {}
+        return dict(zip(self._tasks.sources, self._settings.shares_of(phase), strict=True))
+
     def _whole(self, phase: int) -> bool:
-        members = self._permitted.get(phase)
+        members = self._members(phase)
         if not members:
             return False
         for source, steps in members.items():
@@ -128,7 +138,8 @@ class Recorder(Part):
         return True
 
     def _commit(self, phase: int) -> Commit:
-        members = sorted(self._permitted.pop(phase))
+        members = sorted(self._members(phase))
+        self._permitted.pop(phase, None)
         last = []
         scorers = set(self._scores)
         for source in members:
@@ -153,7 +164,7 @@ class Recorder(Part):
 
     def waiting_for(self) -> str:
         """What the recorder waits for, for people: what the next phase still lacks."""
-        members = self._permitted.get(self.phase)
+        members = self._members(self.phase)
         if not members:
             return f'permission for phase {self.phase} from the learner'
         lacks = []

@@ -110,7 +110,7 @@ def fold(
     kinds = (*core.subscribes, StepRewards)
     work = core.work()
     ours = (entry for entry in bag.entries(kinds) if entry.record.run_id == run.run_id)
-    for entry in causal(ours, settings.lag):
+    for entry in causal(ours, settings.ahead):
         record = as_now(entry.record)
         if isinstance(record, StepRewards):
             folded.recorded.recorded(record)

@@ -114,7 +114,8 @@ def own_run(member: Membership) -> tuple[RunSpec, Settings]:
     who = member.link.full_name
     settings = settled(parameters.own_settings(member.link.node, member.values['config']))
     refuse_in_process_only(who, settings)
-    tasks.check(settings, tasks.find(settings.task))
+    if not settings.on_robot:  # the robot announces its horizon itself
+        tasks.check(settings, tasks.find(settings.task))
     if member.folder:
         refuse_used_folder(who, member.folder, settings)
     made = f'{time.strftime("%Y%m%d-%H%M%S")}-{secrets.token_hex(2)}'

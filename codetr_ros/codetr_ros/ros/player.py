@@ -102,7 +102,7 @@ class Playing(PlayedWiring):
         """Subscribe to what nodes report, and offer to send a phase again."""
         super().open()
         settings = self.joined.settings
-        self._last = Resender(self.member.link, self.joined.run.run_id, settings.lag + 2)
+        self._last = Resender(self.member.link, self.joined.run.run_id, settings.ahead + 2)
 
     # ---- joining
 
@@ -282,7 +282,7 @@ class Player:
     def _make(self, _: RunSpec, settings: Settings, *_more: object) -> Playback:
         learners = [role for role in LEARNERS if role in self._live]
         phases = settings.phases if self._live else self._recorded.phases
-        return Playback(self._items(), phases, settings.lag, learners, self._pace)
+        return Playback(self._items(), phases, settings.ahead, learners, self._pace)
 
     def _wire(self, member: Membership, joined: Joined) -> Playing:
         self._playing = Playing(member, joined, self._recorded, self._live, self._cast)

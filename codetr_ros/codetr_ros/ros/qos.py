@@ -3,7 +3,7 @@
 Every topic is reliable. Topics that a late node must still receive (`run`, `task`, `policy`,
 `commits`) are transient local. Every queue is deeper than the number of messages that the
 permitted phases can put on its topic: KEEP_LAST would drop the rest silently, and KEEP_ALL blocks
-the publisher. The depth is `max(FLOOR, MARGIN * most)`. The table gives `most` for P = lag + 1
+the publisher. The depth is `max(FLOOR, MARGIN * most)`. The table gives `most` for P = ahead + 1
 phases (one more than are ever permitted and not yet committed) of N = phase_steps steps, all
 sources together:
 
@@ -48,7 +48,7 @@ class Quality:
 
 
 def _phases(settings: Settings) -> int:
-    return settings.lag + 1
+    return settings.ahead + 1
 
 
 def _steps(settings: Settings) -> int:

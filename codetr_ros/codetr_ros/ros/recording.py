@@ -67,7 +67,7 @@ class Recording(Wiring):
         for kind in self._full:
             if kind not in (RunSpec, Commit):  # the first has arrived, the second is our own
                 link.subscribe(kind, self.take, settings, raw=True)
-        self._last = Resender(link, self.joined.run.run_id, settings.lag + 2)
+        self._last = Resender(link, self.joined.run.run_id, settings.ahead + 2)
 
     def _bag_folder(self) -> Path | None:
         if self.member.values['bag']:

@@ -191,7 +191,7 @@ class Recovery:
         if isinstance(record, TrueRewards):
             if not self._recorded:
                 # labelled by now, if ever: in a run without labels they must not pile up
-                self._take_in(record.phase - self._settings.lag)
+                self._take_in(record.phase - self._settings.ahead)
             self._coming.append(record)
         elif isinstance(record, CompositeReward):
             self._source(record.source).score(record)

@@ -7,6 +7,7 @@ import difflib
 from typing import Any
 
 from codetr_ros.config import Settings, SettingsError
+from codetr_ros.config.schedule import ROBOT
 from codetr_ros.simulation.control_suite import ControlSuiteEnvironment
 from codetr_ros.simulation.environments import Environment, Task, TaskError
 from codetr_ros.simulation.faults import FAULTS, in_words
@@ -87,6 +88,11 @@ def find(name: str) -> Task:
     """
     if name in TASKS:
         return TASKS[name]
+    if name.startswith(ROBOT):
+        raise TaskError(
+            f'task {name!r} is that of a robot, which nothing simulates: start the nodes of its '
+            'run one by one, as docs/your-robot.md shows, with `ros2 run sim_node robot`'
+        )
     import gymnasium
 
     module = modules.of_task(name)
