@@ -14,10 +14,11 @@ from codetr_ros.offline import converting
 from codetr_ros.offline.converting import Converter
 from codetr_ros.offline.errors import FitError
 from codetr_ros.records import CompositeReward, Transitions
-from codetr_ros.robots import conversion, mapping
+from codetr_ros.robots import conversion
 from codetr_ros.robots.errors import MessageError
 from codetr_ros.robots.mapping import Mapping
 from codetr_ros.robots.message_fields import NS
+from codetr_ros.robots.values import Values, numbers
 
 PLACE = Place(Path('bag'), 0)
 
@@ -322,20 +323,20 @@ def joint_state(names, position):
 
 
 def test_joints_are_found_by_name_whatever_their_order():
-    values = mapping.Values(topic='/j', fields=('position',), joints=('b', 'a'))
-    assert mapping.numbers(joint_state(['a', 'x', 'b'], [1, 2, 3]), values).tolist() == [3, 1]
-    assert mapping.numbers(joint_state(['a'], [1]), values) is None
+    values = Values(topic='/j', fields=('position',), joints=('b', 'a'))
+    assert numbers(joint_state(['a', 'x', 'b'], [1, 2, 3]), values).tolist() == [3, 1]
+    assert numbers(joint_state(['a'], [1]), values) is None
     empty = values.model_copy(update={'fields': ('velocity',)})
-    assert mapping.numbers(joint_state(['a', 'b'], [1, 2]), empty) is None
+    assert numbers(joint_state(['a', 'b'], [1, 2]), empty) is None
 
 
 def test_joints_may_be_named_by_joint_names_as_in_a_trajectory():
-    values = mapping.Values(topic='/t', fields=('points[0].positions',), joints=('b', 'a'))
+    values = Values(topic='/t', fields=('points[0].positions',), joints=('b', 'a'))
     point = SimpleNamespace(positions=np.array([1.0, 2.0, 3.0]))
     message = SimpleNamespace(joint_names=['a', 'x', 'b'], points=[point])
-    assert mapping.numbers(message, values).tolist() == [3, 1]
+    assert numbers(message, values).tolist() == [3, 1]
     with pytest.raises(MessageError, match='/t names no joints: there is neither `name` nor'):
-        mapping.numbers(SimpleNamespace(name='arm', points=[point]), values)
+        numbers(SimpleNamespace(name='arm', points=[point]), values)
 
 
 def test_a_message_that_names_a_joint_twice_is_passed_over_with_a_count():
@@ -357,8 +358,8 @@ def test_a_topic_of_the_mapping_may_lack_its_leading_slash():
 def test_fields_are_reached_by_dots_and_indices():
     pose = SimpleNamespace(x=1.0, y=2.0)
     message = SimpleNamespace(poses=[pose, SimpleNamespace(x=3.0, y=4.0)], data=np.arange(3.0))
-    values = mapping.Values(topic='/p', fields=('poses[1].y', 'data[2]', 'data'))
-    assert mapping.numbers(message, values).tolist() == [4, 2, 0, 1, 2]
+    values = Values(topic='/p', fields=('poses[1].y', 'data[2]', 'data'))
+    assert numbers(message, values).tolist() == [4, 2, 0, 1, 2]
 
 
 @pytest.mark.parametrize(
@@ -373,7 +374,7 @@ def test_fields_are_reached_by_dots_and_indices():
 def test_a_field_that_does_not_exist_is_named_with_those_that_do(path, expected):
     message = SimpleNamespace(poses=[SimpleNamespace(x=1.0, y=2.0)], data=np.arange(3.0))
     with pytest.raises(MessageError, match=expected):
-        mapping.numbers(message, mapping.Values(topic='/p', fields=(path,)))
+        numbers(message, Values(topic='/p', fields=(path,)))
 
 
 @pytest.mark.parametrize(

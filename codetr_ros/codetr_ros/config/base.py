@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
@@ -82,10 +82,12 @@ def validate(kind: type[_G], data: Any, source: str) -> _G:
 def names(kind: type[BaseModel], prefix: str = '') -> Iterator[str]:
     """The dotted names of all settings of a group."""
     for name, field in kind.model_fields.items():
-        inner = field.annotation
-        if isinstance(inner, type) and issubclass(inner, BaseModel):
-            yield from names(inner, f'{prefix}{name}.')
-        else:
+        # a group may be left out: X | None
+        kinds = (field.annotation, *get_args(field.annotation))
+        inner = [k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel)]
+        for each in inner:
+            yield from names(each, f'{prefix}{name}.')
+        if not inner:
             yield prefix + name
 
 

@@ -33,6 +33,11 @@ def convert(bag: Bag, rules: Mapping, folder: Path) -> Conversion:
         BagError: the bag cannot be read, or the new one cannot be written.
         FitError: the mapping names something that is not in the bag.
     """
+    if rules.score is None:
+        raise FitError(
+            'the mapping names no score: without one there is nothing to learn from. Give '
+            '`score`, the topic of scores'
+        )
     order = bag.time_order(rules.topics, stamped=rules.stamped)
     if missing := sorted(rules.topics - bag.topics.keys()):
         raise FitError(

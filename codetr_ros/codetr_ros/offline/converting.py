@@ -26,12 +26,12 @@ import numpy as np
 from codetr_ros.bags.reader import Message
 from codetr_ros.offline.errors import FitError
 from codetr_ros.records import F32, F64, MESSAGE_BYTES, CompositeReward, Transitions
-from codetr_ros.robots import mapping
 from codetr_ros.robots.conversion import JOINTS_DOUBLED, Conversion
 from codetr_ros.robots.doubled_joints import DoubledJoints
 from codetr_ros.robots.episode_scores import EpisodeScores
 from codetr_ros.robots.mapping import Mapping
 from codetr_ros.robots.message_fields import NS, field
+from codetr_ros.robots.values import Values, names_a_joint_twice, numbers
 
 NO_OBSERVATION = 'samples without an observation within max_age'
 NOT_FINITE = 'samples that are not finite'
@@ -80,9 +80,10 @@ class Converter:
         self._open = False
         self._written = 0  # steps of the episode that were written
         self._cut: int | None = None  # when steps of an episode were lost last, as it went on
+        self._score_topic = rules.score.topic if rules.score else None
         self._scores = EpisodeScores(rules, run_id, self.conversion)
         self._sequence = 0
-        self._joints: dict[mapping.Values, DoubledJoints] = {}
+        self._joints: dict[Values, DoubledJoints] = {}
 
     def feed(self, message: Message) -> Iterator[Timed]:
         """Take a message; yields the records that it completes.
@@ -105,7 +106,7 @@ class Converter:
             array = self._numbers(message, self._rules.action)
             if array is not None:
                 yield from self._commanded(array)
-        if message.topic == self._rules.score.topic:
+        if message.topic == self._score_topic:
             self._scores.take(message, self._now)
         if message.topic == self._rules.episode.topic and self._ends(message):
             yield from self._end(self._now, self._rules.episode.terminal)
@@ -139,12 +140,12 @@ class Converter:
         for score in self._scores.finish():
             yield score, self._now - self._shift
 
-    def _numbers(self, message: Message, values: mapping.Values) -> F64 | None:
-        array = mapping.numbers(message.message, values)
+    def _numbers(self, message: Message, values: Values) -> F64 | None:
+        array = numbers(message.message, values)
         if array is not None and values.joints:
             self._joints.setdefault(values, DoubledJoints()).take(array)
         if array is None:
-            twice = mapping.names_a_joint_twice(message.message, values)
+            twice = names_a_joint_twice(message.message, values)
             self.conversion.dropped[JOINT_TWICE if twice else NO_JOINTS] += 1
         return array
 

@@ -16,6 +16,7 @@ from codetr_ros.robots.conversion import Conversion
 from codetr_ros.robots.mapping import Mapping
 from codetr_ros.robots.message_fields import NS, Message, moment, name_in, number
 from codetr_ros.robots.score_booking import Booking, Held, Verdict
+from codetr_ros.robots.score_rules import Score
 from codetr_ros.robots.scored_episode import ScoredEpisode
 
 
@@ -30,10 +31,11 @@ class EpisodeScores:
 
     def __init__(self, rules: Mapping, run_id: str, made: Conversion) -> None:
         self._rules = rules
+        assert rules.score is not None  # who books scores has a rule for them
         self._rule = rules.score
         self._run_id = run_id
         self._made = made
-        self._horizon = _horizon(rules)  # [ns] after its end that an episode is held
+        self._horizon = _horizon(rules.score)  # [ns] after its end that an episode is held
         self._held = Held()
         self._booking = Booking(rules.score, self._held)
         self._ahead: list[Verdict] = []  # whose time has not come yet
@@ -237,9 +239,8 @@ class EpisodeScores:
             self._count(fault, verdict)
 
 
-def _horizon(rules: Mapping) -> float:
+def _horizon(rule: Score) -> float:
     """How long after its end [ns] an episode is held, because a score of it may come."""
-    rule = rules.score
     late = 0.0 if rule.by_arrival and rule.late is None else rule.late
     if rule.stamp is None:
         if rule.of == 'last_episode':

@@ -1,35 +1,21 @@
-"""The mapping file of `codetr convert`: defines the topics of observation, action and score."""
+"""The mapping file: defines the topics of observation, action and score of a robot.
+
+`codetr convert` and the robot node read the same file; its part `live` is for the node alone.
+"""
 
 from collections.abc import Mapping as AnyMapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from codetr_ros.config import Group, SettingsError, in_words, validate
-from codetr_ros.records import F64
-from codetr_ros.robots.errors import MessageError
-from codetr_ros.robots.message_fields import Clock, FieldPath, Timed, Topic, field
+from codetr_ros.robots.live import Live
+from codetr_ros.robots.message_fields import Clock, FieldPath, Timed, Topic
 from codetr_ros.robots.score_rules import Score
+from codetr_ros.robots.values import Values
 from codetr_ros.system.parsing import ParseError, read_yaml
-
-
-class Values(Timed):
-    """Numbers in the messages of a topic."""
-
-    fields: tuple[FieldPath, ...] = Field(
-        min_length=1,
-        description='fields in this order, such as position, data[0] or pose.position.x; an array '
-        'gives all of its elements',
-    )
-    joints: tuple[str, ...] | None = Field(
-        None,
-        min_length=1,
-        description='take only the elements of these joints from array fields, in this order, by '
-        'the field `name` of the message (sensor_msgs/JointState), or else by `joint_names` '
-        '(trajectory_msgs/JointTrajectory)',
-    )
 
 
 class Action(Values):
@@ -118,12 +104,17 @@ class Mapping(Group):
         min_length=1, description='topics, one after the other'
     )
     action: Action
-    score: Score
+    score: Score | None = Field(
+        None, description='`codetr convert` needs it; live, others may score the segments'
+    )
     episode: Episodes = Field(default_factory=Episodes)
     sampling: Sampling = Field(default_factory=Sampling)
+    live: Live | None = Field(None, description='what the robot node needs beyond the topics')
 
     @model_validator(mode='after')
     def _scores_find_episodes(self) -> 'Mapping':
+        if self.score is None:
+            return self
         if self.score.id is not None and self.episode.id is None:
             raise ValueError(
                 'score.id names an episode, but episodes have no names: give episode.id, the '
@@ -149,7 +140,9 @@ class Mapping(Group):
 
     def _clocks(self) -> list[tuple[str, Clock]]:
         parts: tuple[Timed | Episodes, ...]
-        parts = (*self.observation, self.action, self.score, self.episode)
+        parts = (*self.observation, self.action, self.episode)
+        if self.score is not None:
+            parts = (*parts, self.score)
         return [(part.topic, part.time or self.time) for part in parts if part.topic]
 
     @model_validator(mode='after')
@@ -158,6 +151,12 @@ class Mapping(Group):
         for topic, clock in self._clocks():
             if clock != clocks[topic]:
                 raise ValueError(f'{topic} has two times, log and header: a topic has one')
+        return self
+
+    @model_validator(mode='after')
+    def _live_commands_have_one_size(self) -> 'Mapping':
+        if self.live is not None:
+            self.live.check(self.action.low, self.action.high, len(self.action.joints or ()))
         return self
 
 
@@ -176,54 +175,3 @@ def load(path: Path) -> Mapping:
     if not isinstance(data, AnyMapping):
         raise SettingsError(f'mapping {path} must hold a mapping, not {type(data).__name__}')
     return validate(Mapping, data, f'mapping {path}')
-
-
-def joint_names(message: Any, topic: str) -> list[str]:
-    """The names of the joints that the arrays of a message are of.
-
-    Raises:
-        MessageError: it has none.
-    """
-    for name in ('name', 'joint_names'):
-        names = getattr(message, name, None)
-        if isinstance(names, (list, tuple)):
-            return list(names)
-    there = [name for name in getattr(message, '__dict__', ()) if not name.startswith('_')]
-    raise MessageError(
-        f'{topic} names no joints: there is neither `name` nor `joint_names` in '
-        + (', '.join(there) or type(message).__name__)
-        + '. Leave out `joints`, and name elements such as data[0]'
-    )
-
-
-def names_a_joint_twice(message: Any, values: Values) -> bool:
-    """Whether a message names one of the joints of the mapping more than once."""
-    names = joint_names(message, values.topic) if values.joints else []
-    return any(names.count(joint) > 1 for joint in values.joints or ())
-
-
-def numbers(message: Any, values: Values) -> F64 | None:
-    """The numbers of a message, in order; None if a joint is missing, or named twice.
-
-    Raises:
-        MessageError: a field does not exist or holds no numbers.
-    """
-    rows: list[int] | None = None
-    if values.joints is not None:
-        names = joint_names(message, values.topic)
-        if any(names.count(joint) != 1 for joint in values.joints):
-            return None
-        rows = [names.index(joint) for joint in values.joints]
-    arrays = []
-    for path in values.fields:
-        value = field(message, path, values.topic)
-        try:
-            array = np.atleast_1d(np.asarray(value, np.float64)).ravel()
-        except (TypeError, ValueError):
-            raise MessageError(f'{values.topic}: field {path!r} holds no numbers') from None
-        if rows is not None:
-            if len(array) <= max(rows):
-                return None  # JointState leaves unknown fields empty
-            array = array[rows]
-        arrays.append(array)
-    return np.concatenate(arrays)

@@ -1,10 +1,31 @@
 """The checks of a policy before a simulator or the evaluator acts under it."""
 
+from typing import Protocol
+
 from codetr_ros.config import Settings
 from codetr_ros.policy.acting import ActingPolicy, NetworkError
 from codetr_ros.records import INITIAL_VERSION, Policy, Record, RecordError, RunSpec, describe
 from codetr_ros.records.checks import check_run
-from codetr_ros.simulation.tasks import Environment
+
+
+class Stage(Protocol):
+    """Where a policy is to act: an environment, or a robot."""
+
+    @property
+    def name(self) -> str:
+        """The name of the task."""
+
+    @property
+    def observation_size(self) -> int:
+        """O."""
+
+    @property
+    def action_size(self) -> int:
+        """A."""
+
+    @property
+    def horizon(self) -> int:
+        """Steps after which an episode is truncated."""
 
 
 def check_policy(policy: Record, run: RunSpec, settings: Settings, receiver: str) -> Policy:
@@ -36,9 +57,7 @@ def check_policy(policy: Record, run: RunSpec, settings: Settings, receiver: str
     return policy
 
 
-def acting_policy(
-    policy: Policy, environment: Environment, settings: Settings
-) -> ActingPolicy | None:
+def acting_policy(policy: Policy, environment: Stage, settings: Settings) -> ActingPolicy | None:
     """The policy to act with in an environment; None for the uniformly random one.
 
     Args:

@@ -1,0 +1,343 @@
+"""A robot in place of a simulator: it acts under the policies that it receives, and publishes what
+it did.
+
+At the pace `permitted` it takes the steps of a phase once they are permitted, and is held by the
+safe command meanwhile. At the pace `free` it goes on under its newest policy. A policy that
+arrives is used from the next control step on: nothing changes within one.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from codetr_ros.config import Settings, SettingsError
+from codetr_ros.cores.core import Part
+from codetr_ros.policy.acting import ActingPolicy, uniform_actions
+from codetr_ros.records import (
+    F32,
+    F64,
+    INITIAL_VERSION,
+    PROTOCOL_VERSION,
+    Metrics,
+    Policy,
+    Record,
+    RecordError,
+    RunSpec,
+    TaskSpec,
+    Transitions,
+    describe,
+    metrics,
+)
+from codetr_ros.records.roles import subscribed
+from codetr_ros.robots import mapping
+from codetr_ros.robots.control import Control
+from codetr_ros.robots.deadlines import Deadlines
+from codetr_ros.robots.guard import Guard, Hold
+from codetr_ros.robots.reset import Resetting
+from codetr_ros.robots.senses import Senses
+from codetr_ros.robots.steplog import StepLog
+from codetr_ros.runs.reports import CoreReport
+from codetr_ros.seeding import generator
+from codetr_ros.simulation.permission import acting_policy, check_policy
+
+PERMISSION, BEHIND, FINISHED = 'permission', 'learner behind', 'end of the run'
+
+
+@dataclass(frozen=True)
+class Stage:
+    """The robot as a task.
+
+    Attributes:
+        name: the name of the task.
+        observation_size: O.
+        action_size: A.
+        horizon: steps after which an episode is cut off.
+    """
+
+    name: str
+    observation_size: int
+    action_size: int
+    horizon: int
+
+
+class Robot(Part):
+    """Drives a robot under the policies that it receives.
+
+    The wiring sets `send` and `ask_for_reset`, and calls `senses.take` for what the robot
+    publishes. A control step is taken by `work` once it is due by the clock.
+
+    Args:
+        run: the run it belongs to.
+        settings: the settings of the run.
+        name: its name, which is that of its source.
+        rules: the mapping; its part `live` must be there.
+        clock: seconds, never going back.
+
+    Raises:
+        SettingsError: the task is that of a simulation, the mapping has no part `live`, or the
+            delay exceeds its episodes.
+    """
+
+    subscribes = subscribed('sim')
+
+    def __init__(
+        self,
+        run: RunSpec,
+        settings: Settings,
+        name: str,
+        rules: mapping.Mapping,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        super().__init__()
+        if not settings.on_robot:
+            raise SettingsError(
+                f'task = {settings.task}: a robot node needs the task of a robot, robot/NAME; '
+                'start `ros2 run sim_node sim` for a simulation, or the learner with another task'
+            )
+        if rules.live is None:
+            raise SettingsError(
+                'the mapping has no part `live`, which a robot node needs: docs/your-robot.md has '
+                'an example'
+            )
+        self._live = rules.live
+        if settings.within(self._live.episode_steps).longest > self._live.episode_steps:
+            raise SettingsError(
+                f'delay = {settings.delay}: episodes of the robot have '
+                f'{self._live.episode_steps} steps (live.episode_steps); choose a shorter delay'
+            )
+        self._run = run
+        self._settings = settings
+        self._name = name
+        self.clock = clock
+        self.rules = rules
+        self.send: Callable[[F64], None] = lambda command: None
+        self.ask_for_reset: Callable[[], None] = lambda: None
+        self.deadlines = Deadlines(self._live.period)
+        self._log = StepLog(run.run_id, name, settings.steps_of)
+        self.senses = Senses(rules)
+        self.guard = Guard(self._live, self.senses, clock())
+        self.control = Control(
+            rules,
+            self.senses,
+            self.guard,
+            self,
+            self._log,
+            self._command,
+            Resetting(self._live.reset, self._ask),
+        )
+        self._permitted: dict[int, tuple[Policy, ActingPolicy | None]] = {}
+        self._now: tuple[Policy, ActingPolicy | None] | None = None  # under which it acts
+        self._newest: tuple[Policy, ActingPolicy | None] | None = None
+        self._last: Policy | None = None  # the one that permits nothing more
+        self._out: list[Record] = []  # made between two slices
+        self.versions: Counter[int] = Counter()  # steps begun under each policy
+
+    # ---- records
+
+    @property
+    def stage(self) -> Stage:
+        """The robot as a task; its sizes are known once each topic has brought something."""
+        return Stage(
+            self._settings.task,
+            self.senses.size,
+            self.control.limiter.size,
+            self._live.episode_steps,
+        )
+
+    def receive(self, record: Record) -> None:
+        """Keep a policy until its phase's turn; at a free pace until the next control step.
+
+        Raises:
+            RecordError: it is of another run, names no steps for this robot, comes twice, or its
+                weights do not fit; nothing has changed then.
+        """
+        policy = check_policy(record, self._run, self._settings, f'robot {self._name!r}')
+        if not policy.steps.any():
+            self._last = policy
+            return
+        if self._name not in policy.sources:
+            raise RecordError(
+                f'{describe(policy)} names sources={list(policy.sources)}, not {self._name!r}: '
+                'stop the other robot or simulator'
+            )
+        if not self.senses.size:
+            raise RecordError(f'{describe(policy)} comes before {self._name!r} is announced')
+        made = policy, acting_policy(policy, self.stage, self._settings)
+        if self._settings.free:
+            if self._newest is None or policy.phase > self._newest[0].phase:
+                self._newest = made
+            else:
+                self.duplicated['policy'] += 1
+            return
+        if policy.phase < self._log.phase or policy.phase in self._permitted:
+            raise RecordError(
+                f'{describe(policy)}: {self._name!r} has phase={policy.phase} already: each phase '
+                'must be permitted once. Stop the second learner, if there is one'
+            )
+        self._permitted[policy.phase] = made
+
+    def _spec(self) -> TaskSpec:
+        stage, r_max = self.stage, self._settings.r_max
+        return TaskSpec(
+            run_id=self._run.run_id,
+            protocol_version=PROTOCOL_VERSION,
+            source=self._name,
+            task=stage.name,
+            observation_size=stage.observation_size,
+            action_size=stage.action_size,
+            horizon=stage.horizon,
+            control_period=self._live.period,
+            r_max=1.0 if r_max is None else r_max,
+        )
+
+    # ---- the loop
+
+    def work(self) -> Iterator[list[Record] | None]:
+        """Yield what the robot is, then the records of each control step that was due."""
+        while not self.senses.size:
+            yield None
+        yield [self._spec()]
+        while not self.finished:
+            if not self.deadlines.reached(self.clock()):
+                yield self._given([])
+                continue
+            yield self._given(self.control.tick(self.clock()))
+            if self._last is not None and self._log.phase >= self._settings.phases:
+                yield self.deactivate()
+                self.finished = True
+        while True:
+            yield None
+
+    def _given(self, records: list[Transitions]) -> list[Record] | None:
+        """Records, those that were made between two slices first; None if nothing is due."""
+        given = [*self._out, *records]
+        self._out = []
+        for record in records:
+            if record.phase_end:
+                given.append(self._metrics(record.phase))
+        return given or None
+
+    @property
+    def pause(self) -> float:
+        """Seconds until the next control step is due."""
+        return max(0.0, self.deadlines.due - self.clock())
+
+    def _choose(self) -> None:
+        """Take the newest policy, or the one of the phase that the next step belongs to."""
+        if self._settings.free:
+            self._now = self._newest
+        else:
+            phase = self._log.phase + (self._log.left <= 0)
+            self._permitted = {k: each for k, each in self._permitted.items() if k >= phase - 1}
+            self._now = self._permitted.get(phase)
+
+    # ---- for the control
+
+    def _command(self, command: F64) -> None:
+        self.send(command)
+
+    def _ask(self) -> None:
+        self.ask_for_reset()
+
+    def withheld(self) -> Hold | None:
+        """Choose the policy of this control step; returns why none acts, or None if one does."""
+        self._choose()
+        settings, log = self._settings, self._log
+        if log.total >= settings.steps:
+            return Hold(FINISHED, 'all steps of the run are taken')
+        if self._now is None:
+            return Hold(PERMISSION, 'no policy permits a step')
+        if settings.free:
+            learnt = self._now[0].version
+            if log.total // settings.phase_steps > max(learnt, INITIAL_VERSION) + settings.ahead:
+                return Hold(
+                    BEHIND,
+                    f'the learner is {settings.ahead} phases behind: its newest policy has learnt '
+                    f'from phase {learnt}',
+                )
+        return None
+
+    def act(self, observation: F32, step: int) -> F32:
+        """The action for an observation, under the policy of this control step."""
+        assert self._now is not None
+        policy, acting = self._now
+        self.versions[policy.version] += 1
+        rng = generator(self._settings.seed, 'noise', self._name, self._log.total)
+        size = self.control.limiter.size
+        if acting is None:
+            drawn: F32 = uniform_actions(rng, 1, size)[0]
+            return drawn
+        return acting.act(observation, rng.standard_normal(size, dtype=np.float32), step)
+
+    # ---- what people ask for
+
+    def activate(self) -> None:
+        """Drive the robot: the first control step is due now."""
+        self.control.activate()
+        self.deadlines.start(self.clock())
+
+    def deactivate(self) -> list[Record]:
+        """Send the safe command once more, then none."""
+        records = self._given(self.control.deactivate())
+        self.deadlines.stop()
+        return records or []
+
+    def leave_active(self) -> None:
+        """The same between two slices."""
+        self._out = self.deactivate()
+
+    # ---- reports
+
+    def waiting_for(self) -> str:
+        """What the robot waits for, for people."""
+        if lacking := self.senses.lacking():
+            fault = f' ({self.senses.fault})' if self.senses.fault else ''
+            return f'the first message on {", ".join(lacking)}{fault}'
+        if not self.control.active:
+            return 'the service `activate`, which lets it move the robot'
+        held = self.control.held
+        return held.why if held is not None else 'the next control step'
+
+    def _metrics(self, phase: int) -> Metrics:
+        step = self._settings.steps_after(phase)
+        values = self.deadlines.metrics() | {'episodes': float(self.control.counts['episodes'])}
+        if self._now is not None:
+            values['policy_version'] = float(self._now[0].version)
+        return metrics(self._run.run_id, 'sim', self._name, phase, step, values)
+
+    def close(self) -> None:
+        """Leave the robot with the safe command."""
+        if self.control.active:
+            self.control.halt()
+            self.control.active = False
+
+    def report(self) -> CoreReport:
+        """Counts for the run's summary."""
+        counters = self.control.counts + self.senses.counts
+        counters['steps'] = self._log.total
+        counters['policies used'] = len(self.versions)
+        whole = {name: round(value) for name, value in self.deadlines.metrics().items()}
+        counters['control steps'] = whole['control_steps']
+        counters['control deadlines missed'] = whole['deadlines_missed']
+        counters['resets that failed'] = self.control.reset.failures
+        return CoreReport(
+            duplicated=dict(self.duplicated), counters={k: n for k, n in counters.items() if n}
+        )
+
+
+def load_rules(path: str) -> mapping.Mapping:
+    """Read the mapping of a robot node.
+
+    Raises:
+        SettingsError: no file was named, or it is not sound.
+    """
+    if not path:
+        raise SettingsError(
+            'a robot node needs the parameter mapping, the file that names the topics of the '
+            'robot: docs/your-robot.md has an example'
+        )
+    return mapping.load(Path(path))
