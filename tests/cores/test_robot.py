@@ -99,10 +99,12 @@ def test_a_policy_that_arrives_is_used_from_the_next_control_step_on_and_never_w
     old = bench.permit(1, seed=1)
     bench.step(2)
     before = list(bench.sent)
-    bench.permit(2, seed=2)  # after the command of this step has left, before the next is due
+    bench.clock.now -= 0.05  # the command of this step has left, and the next is not due
+    bench.permit(2, seed=2)
     assert next(bench.work) is None
     assert bench.sent == before
     assert bench.robot.versions == {old.version: 2}
+    bench.clock.now += 0.05
     bench.step()
     assert bench.robot.versions == {old.version: 2, old.version + 1: 1}
 
