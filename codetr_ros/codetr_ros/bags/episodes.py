@@ -123,6 +123,8 @@ class SourceChecks:
         self._lengths = array('I')  # steps of each episode so far
         self._until = array('I')  # steps of each episode up to the end of its last scored segment
         self._ended = array('B')
+        self.abandoned = 0  # episodes that their source could not go on with
+        self._may_be_scored: set[tuple[int, int, int]] = set()  # the segments that they cut short
         self._last: tuple[int, int, bytes] | None = None  # episode, next step, its observation
         self._due: dict[Span, tuple[int, Any]] = {}  # segments without score -> sequence, place
         # scores whose steps have not come, chunks without true rewards, true rewards without chunk
@@ -170,6 +172,9 @@ class SourceChecks:
         """Check that the steps go on where the last ones ended."""
         expected: tuple[int, int] = (0, 0) if self._last is None else self._last[:2]
         ended = chunk.terminated or chunk.truncated
+        if (chunk.episode, chunk.first_step) == (expected[0] + 1, 0) and expected[1]:
+            self._abandon(*expected)
+            expected = chunk.episode, 0
         if (chunk.episode, chunk.first_step) != expected:
             self._findings.add(
                 'gap',
@@ -185,6 +190,15 @@ class SourceChecks:
         after = chunk.first_step + chunk.steps
         next_ = (chunk.episode + 1, 0) if ended else (chunk.episode, after)
         self._last = (*next_, chunk.observations[-1].tobytes())
+
+    def _abandon(self, episode: int, after: int) -> None:
+        """Note that an episode ends where it is: its source could not go on with it, and begins
+        the next one. The segment that is cut short may have a score.
+        """
+        self.abandoned += 1
+        if self.cuts is not None:
+            for first, length in self.cuts.segments(self.name, episode, after, after, True):
+                self._may_be_scored.add((episode, first, length))
 
     def _lengthen(self, chunk: Transitions, place: Any) -> None:
         """Note the segments that end with these steps."""
@@ -215,13 +229,14 @@ class SourceChecks:
         self.scored += reward.length
         if self.cuts is not None:
             span = episode, reward.first_step, reward.length
-            if self._due.pop(span, None) is None:
+            if self._due.pop(span, None) is None and span not in self._may_be_scored:
                 self._findings.add(
                     'segment',
                     place,
                     f'{describe(reward)} scores what is no segment of {self.cuts}, or has its '
                     'score already',
                 )
+            self._may_be_scored.discard(span)
         elif reward.first_step < self._until[episode]:
             self._findings.add(
                 'segment', place, f'{describe(reward)} scores steps that have their score already'

@@ -45,8 +45,24 @@ class Evaluator(Part):
             deque()
         )  # purpose, version, policy
         self._seen: set[int] = set()  # versions that are evaluated or wait for it
+        self._done: dict[int, set[int]] = {}  # episodes of each that were evaluated before
         self._counters: Counter[str] = Counter()
         self._closed = False
+
+    def restore(self, record: Record) -> None:
+        """Take one of the results that it has published before: that episode is not run again.
+        Others' results, and other kinds of records, are passed over.
+        """
+        if not isinstance(record, EpisodeResult) or record.purpose == 'training':
+            return
+        done = self._done.setdefault(record.version, set())
+        if record.episode in done:
+            return
+        done.add(record.episode)
+        self._counters.update(episodes=1, steps=record.length)
+        if len(done) == self._settings.evaluate_episodes:
+            self._seen.add(record.version)
+            self._count(record.version)
 
     def receive(self, record: Record) -> None:
         """Keep a policy whose version is due for evaluation.
@@ -74,13 +90,18 @@ class Evaluator(Part):
                 yield None
                 continue
             purpose, version, acting = self._waiting.popleft()
-            for episode in range(self._settings.evaluate_episodes):
+            done = self._done.pop(version, set())
+            due = [n for n in range(self._settings.evaluate_episodes) if n not in done]
+            for episode in due:
                 result = self._evaluate(purpose, version, acting, episode)
-                last = episode == self._settings.evaluate_episodes - 1
-                if last:
-                    self._counters['evaluations'] += 1
-                    self.finished = self.finished or version == self._settings.phases - 1
+                if episode == due[-1]:
+                    self._count(version)
                 yield [result]
+
+    def _count(self, version: int) -> None:
+        """Count an evaluation that is complete."""
+        self._counters['evaluations'] += 1
+        self.finished = self.finished or version == self._settings.phases - 1
 
     def _evaluate(
         self, purpose: str, version: int, acting: ActingPolicy | None, number: int

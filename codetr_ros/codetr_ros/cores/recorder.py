@@ -87,6 +87,33 @@ class Recorder(Part):
             check_score(record, self._settings.scored_at_most, self._settings.score_missing > 0)
             self._next(record, self._scores, record.scorer)
 
+    def restore(self, record: Record) -> None:
+        """Take one of the records that the bag holds already, in the bag's order, commits among
+        them. Call it before `work`, which then goes on with the first phase that has no commit.
+
+        Raises:
+            RecordError: it was refused before too, or a commit names what the bag does not hold.
+        """
+        if not isinstance(record, Commit):
+            if isinstance(record, self.subscribes):
+                self.receive(record)
+            return
+        if record.phase != self.phase or not self._whole(record.phase):
+            raise RecordError(
+                f'{describe(record)} is in the bag, where phase {self.phase} is the next to be '
+                f'committed and {self.waiting_for()} is lacking: the bag is damaged. '
+                '`codetr bag verify` lists what is missing'
+            )
+        made = self._commit(record.phase)
+        for field in ('sources', 'transitions', 'scorers', 'scores'):
+            is_, was = (np.array(getattr(one, field)).tolist() for one in (made, record))
+            if is_ != was:
+                raise RecordError(
+                    f'{describe(record)} names {field} {was}, and the bag holds {is_} before it: '
+                    'the bag is damaged. `codetr bag verify` lists what is wrong'
+                )
+        self.phase = record.phase + 1
+
     def _next(self, record: Any, due: 'Counter[str]', name: str) -> bool:
         if record.sequence > due[name]:
             raise RecordError(
@@ -101,7 +128,7 @@ class Recorder(Part):
 
     def work(self) -> Iterator[list[Record] | None]:
         """Yield a commit for each phase, in order, as soon as it is whole."""
-        for phase in range(self._settings.phases):
+        for phase in range(self.phase, self._settings.phases):
             began = time.perf_counter()
             while not self._whole(phase):
                 yield None

@@ -61,6 +61,33 @@ class Simulator(Part):
         self._counters: Counter[str] = Counter()
         self._closed = False
 
+    def restore(self, record: Record) -> None:
+        """Take one of the records that it has published before, in order: transitions, true
+        rewards and scores of committed phases. Those of other sources, and other kinds, are
+        passed over.
+        """
+        for source in self._sources:
+            if getattr(record, 'source', None) == source.name:
+                source.restore(record)
+
+    def resume(self, phase: int) -> None:
+        """Go on behind what was restored. Call it before `work`, if at all.
+
+        Each environment is brought back to where it was: reset with the episode's seed it takes
+        the recorded actions again. Where it then does something else than recorded, its episode
+        ends as truncated with the next phase; that is logged and counted.
+
+        Args:
+            phase: the next to be run: the first that is not committed.
+
+        Raises:
+            TaskError: an environment is at fault.
+        """
+        self._phase = phase
+        self._counters['phases'] = phase
+        for source in self._sources:
+            source.resume()
+
     def receive(self, record: Record) -> None:
         """Keep a policy until its phase's turn.
 

@@ -73,6 +73,9 @@ class Store:
         """The episode that these steps go on with or begin."""
         last = source.newest
         expected = (0, 0)
+        if last is not None and (chunk.episode, chunk.first_step) == (last.number + 1, 0):
+            # its source could not go on with the one before, which ends as truncated
+            last.ended = True
         if last is not None:
             expected = (last.number + 1, 0) if last.ended else (last.number, last.steps)
         if (chunk.episode, chunk.first_step) != expected:

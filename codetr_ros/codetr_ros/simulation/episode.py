@@ -3,7 +3,7 @@
 Simulators and the evaluator share this code, so that a score means the same in both.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,8 +75,11 @@ class EpisodeRunner:
 
     def reset(self, seed: int, number: int) -> None:
         """Start episode `number`, from the start that `seed` determines."""
-        settings, horizon = self._settings, self._environment.horizon
         self.observation = self._environment.reset(seed)
+        self._begin(number)
+
+    def _begin(self, number: int) -> None:
+        settings, horizon = self._settings, self._environment.horizon
         self.terminated = self.truncated = False
         self.length = self._first_step = 0
         ends = settings.lengths.ends(settings.seed, self._name, number, horizon)
@@ -96,11 +99,26 @@ class EpisodeRunner:
             CompositeError: the segment's composite reward is not finite.
         """
         self.observation, reward, self.terminated = self._environment.step(action)
+        return reward, self._note(reward, self._environment.truncated)
+
+    def abandon(self, rewards: Sequence[float], number: int) -> Score | None:
+        """End episode `number` as truncated after steps of these rewards, as if they had been
+        taken here: for an environment that cannot be brought back to where they led.
+
+        Returns:
+            The score of the segment that is cut short, if one is.
+        """
+        self._begin(number)
+        for reward in rewards[:-1]:
+            self._note(reward, False)
+        return self._note(rewards[-1], True)
+
+    def _note(self, reward: float, cut: bool) -> Score | None:
+        """Note a step's reward; the score of the segment that it completed or cut short."""
         self._rewards[self.length] = reward
         self.length += 1
-        cut = self._environment.truncated
         if self.length < self._due and not self.terminated and not cut:
-            return reward, None
+            return None
         ends = cut or self.length == self._environment.horizon
         self.truncated = ends and not self.terminated
         first, settings = self._first_step, self._settings
@@ -110,7 +128,7 @@ class EpisodeRunner:
         self._first_step = self.length
         self._due = next(self._ends, self._environment.horizon)
         self._composite_return += score.value
-        return reward, score
+        return score
 
     def result(
         self, run_id: str, source: str, purpose: str, step: int, version: int, episode: int

@@ -1,5 +1,6 @@
 """A source: one environment whose episodes become records, chunk by chunk."""
 
+import logging
 import math
 from collections import Counter
 from collections.abc import Iterator
@@ -22,8 +23,11 @@ from codetr_ros.records import (
 from codetr_ros.seeding import generator, seed_global
 from codetr_ros.simulation.chunks import steps_of_chunks
 from codetr_ros.simulation.episode import EpisodeRunner, Score
+from codetr_ros.simulation.open_episode import DiffersError, OpenEpisode
 from codetr_ros.simulation.scorer import Scorer, ScoreScale
 from codetr_ros.simulation.tasks import make, r_max
+
+_log = logging.getLogger(__name__)
 
 
 class Source:
@@ -58,6 +62,8 @@ class Source:
         self._episodes = -1  # number of the present one
         self._sequence = 0  # of the next chunk
         self._scores = 0  # scores given so far: the sequence number of the next
+        self._recorded = OpenEpisode(settings, name)
+        self._lost = False  # whether the episode recorded last cannot be gone on with
 
     def spec(self) -> TaskSpec:
         """The announcement of what this source simulates."""
@@ -73,6 +79,80 @@ class Source:
             control_period=environment.control_period,
             r_max=r_max(self._settings, environment),
         )
+
+    def restore(self, record: Record) -> None:
+        """Take what this source has published before: chunks, true rewards and scores, in order.
+
+        Without true rewards only observations are compared by `resume`.
+        """
+        self._recorded.take(record)
+
+    def resume(self) -> None:
+        """Go on where what was restored ends: the episode that was under way is under way again.
+
+        Where the environment does something else than recorded, that episode ends as truncated:
+        what ends it is published with the next phase, is logged, and is counted.
+
+        Raises:
+            TaskError: the environment is at fault.
+        """
+        before = self._recorded
+        self._episodes, self._sequence, self._scores = (
+            before.episode, before.sequence, before.scores,
+        )  # fmt: skip
+        self.counters = +before.counters
+        if not before.steps:
+            return
+        try:
+            before.go_through(self._episode, self._scorer)
+        except DiffersError as error:
+            _log.error(
+                '%s: the environment cannot be brought back to step %s of episode %s: %s. It is '
+                'not deterministic: the episode ends there as truncated',
+                self.name,
+                before.steps,
+                before.episode,
+                error,
+            )
+            self.counters['episodes cut short, as the environment did not repeat them'] += 1
+            self._lost = True
+
+    def _abandoned(self, policy: Policy) -> list[Record]:
+        """What ends an episode that cannot be gone on with; the next one follows on it."""
+        if not self._lost:
+            return []
+        self._lost = False
+        self.counters['episodes'] += 1
+        number, before = self._episodes, self._recorded
+        records: list[Record] = [
+            self._score(score, given, number)
+            for score, given in before.abandon(self._episode, self._scorer)
+        ]
+        self.counters['scores'] += len(records)
+        if self._episode.length == before.steps:  # else not all of its rewards are known
+            step = self._steps_at(policy, 0)
+            run_id, version = self._run.run_id, policy.version
+            records.append(
+                self._episode.result(run_id, self.name, 'training', step, version, number)
+            )
+        return records
+
+    def _score(self, score: Score, given: float, episode: int) -> CompositeReward:
+        """The next score of this source."""
+        if math.isnan(given):
+            self.counters['scores missing'] += 1
+        record = CompositeReward(
+            run_id=self._run.run_id,
+            source=self.name,
+            scorer=self.name,
+            sequence=self._scores,
+            episode=episode,
+            first_step=score.first_step,
+            length=score.length,
+            value=given,
+        )
+        self._scores += 1
+        return record
 
     def roll_out(self, policy: Policy, acting: ActingPolicy | None) -> Iterator[list[Record]]:
         """Take the steps that a policy permits: the records of one chunk at a time, the chunk
@@ -92,6 +172,7 @@ class Source:
             else rng.standard_normal((steps, size), dtype=np.float32)
         )
         taken, scores_before = 0, self._scores
+        ending = self._abandoned(policy)
         while taken < steps:
             # others draw from them between two chunks
             seed_global(self._settings.seed, 'environment', self.name, policy.phase, taken)
@@ -102,7 +183,8 @@ class Source:
                 self._scorer.begin(self._episodes)
             done, records = self._chunk(policy, acting, draws[taken:], taken, scores_before)
             taken += done
-            yield records
+            yield [records[0], *ending, *records[1:]]
+            ending = []
 
     def permitted(self, policy: Policy) -> int:
         """Steps that a policy permits this source."""
@@ -173,22 +255,7 @@ class Source:
             ),
         ]
         for score in scores:
-            given = self._scorer.given(score.value)
-            if math.isnan(given):
-                self.counters['scores missing'] += 1
-            records.append(
-                CompositeReward(
-                    run_id=run_id,
-                    source=source,
-                    scorer=source,
-                    sequence=self._scores,
-                    episode=number,
-                    first_step=score.first_step,
-                    length=score.length,
-                    value=given,
-                )
-            )
-            self._scores += 1
+            records.append(self._score(score, self._scorer.given(score.value), number))
         self._sequence += 1
         self.counters.update(chunks=1, steps=t, scores=len(scores))
         if episode.over:
