@@ -13,7 +13,6 @@ Messages are taken as the CDR bytes received: nothing is decoded, so nothing can
 """
 
 import os
-import shutil
 from collections import Counter
 from collections.abc import Iterable
 from contextlib import suppress
@@ -28,6 +27,7 @@ from codetr_ros.bags.errors import BagError, BagWriteError, Place
 from codetr_ros.bags.metadata import METADATA, BagFile, render
 from codetr_ros.bags.raw import LIBRARY
 from codetr_ros.bags.topics import BagTopic, schema_text, type_hash
+from codetr_ros.system.disk import Disk
 from codetr_ros.system.files import atomic_write, remedy, sync_folder
 
 CHUNK_BYTES = 64 * 1024
@@ -60,6 +60,7 @@ class McapWriter:
         split_bytes: size at which the next file is begun; 0: never.
         keep_free: `check_room` raises an error when the disk has fewer bytes left.
         written: what the bag holds (`reopening.reopen`), to go on with it in its next file.
+        disk: where it lies; None: the disk of this machine.
 
     Raises:
         BagError: the folder holds something or cannot be made, or a type is not installed.
@@ -73,6 +74,7 @@ class McapWriter:
         split_bytes: int = SPLIT_BYTES,
         keep_free: int = 0,
         written: Written | None = None,
+        disk: Disk | None = None,
     ) -> None:
         self.folder = folder
         written = written or Written()
@@ -82,6 +84,7 @@ class McapWriter:
         self._chunk_bytes = chunk_bytes
         self._split_bytes = split_bytes
         self._keep_free = keep_free
+        self._disk = disk or Disk()
         self._files = list(written.files)
         self._finished = written.bytes  # of the files that are finished
         self._path: Path | None = None  # of the file that is not
@@ -119,7 +122,7 @@ class McapWriter:
             for topic in self._topics.values()
         ]
         path = self.folder / file.name
-        self._stream = path.open('xb')
+        self._stream = self._disk.create(path)
         self._path = path
         self._files.append(file)
         self._writer: Any = Writer(  # its methods carry no types
@@ -202,8 +205,7 @@ class McapWriter:
 
     def _sync(self) -> None:
         self._writer.flush()
-        self._stream.flush()
-        os.fsync(self._stream.fileno())
+        self._disk.sync(self._stream)
         self._good = self._stream.tell()
 
     def flush(self) -> None:
@@ -225,7 +227,7 @@ class McapWriter:
             BagError: the disk has less room left than is to be kept. The bag is unchanged.
         """
         try:
-            free = shutil.disk_usage(self.folder).free
+            free = self._disk.free(self.folder)
         except OSError as error:
             raise BagError(
                 f'bag {self.folder}: the room left on its disk is unknown: {error.strerror}. Mend '
@@ -242,8 +244,7 @@ class McapWriter:
         """Write the file's index."""
         self._sync()
         self._writer.finish()
-        self._stream.flush()
-        os.fsync(self._stream.fileno())
+        self._disk.sync(self._stream)
         self._finished += self._stream.tell()
         self._stream.close()
         self._path, self._good = None, 0

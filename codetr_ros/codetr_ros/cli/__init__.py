@@ -23,6 +23,7 @@ commands:
   benchmark  do many runs under one protocol, and make a table of them
   bag        show, check, recover or play a bag
   tasks      list the tasks that have a name
+  simtest    simulate whole runs in which messages, disks and nodes fail
   doctor     check Python, ROS, discovery, shared memory, torch and MuJoCo
 
 `codetr COMMAND --help` explains the options of a command (of `train` and `fit` the settings that
@@ -84,6 +85,12 @@ def _tasks(arguments: Sequence[str]) -> int:
     return list_tasks.main(arguments)
 
 
+def _simtest(arguments: Sequence[str]) -> int:
+    from codetr_ros.cli import simtest
+
+    return simtest.main(arguments)
+
+
 def _doctor(arguments: Sequence[str]) -> int:
     from codetr_ros.cli import doctor
 
@@ -100,6 +107,7 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     'benchmark': _benchmark,
     'bag': _bag,
     'tasks': _tasks,
+    'simtest': _simtest,
     'doctor': _doctor,
 }
 

@@ -53,6 +53,7 @@ class Learner(Consumer):
         self.subscribes = subscribed('learner', settings.labels_steps)
         super().__init__(run, settings, name, folder, scores=not settings.labels_steps)
         self._labels: dict[int, dict[int, StepRewards]] = {}
+        self._applied = 0  # labels of phases before this one have been taken in
         self._learner: PolicyLearner | None = None
 
     def receive(self, record: Record) -> None:
@@ -82,7 +83,7 @@ class Learner(Consumer):
                 f'{describe(record)}: part {record.part} of {record.parts}, where others of the '
                 f'phase are of {others}: two reward nodes? Stop one of them'
             )
-        if record.phase < self._phase or record.part in parts:
+        if record.phase < self._applied or record.part in parts:
             self.duplicated[TOPICS[StepRewards]] += 1
         else:
             self._labels.setdefault(record.phase, {})[record.part] = record
@@ -101,6 +102,7 @@ class Learner(Consumer):
         learner.updates = int(checkpoint.meta[going_on.KEY]['updates'])
         learner.counters.clear()
         learner.counters.update(going_on.counted(checkpoint.meta, 'learner_counters'))
+        self._applied = phase + 1
         for early in [early for early in self._labels if early <= phase]:
             del self._labels[early]
         return self._published(phase, self._last_metrics)
@@ -115,6 +117,7 @@ class Learner(Consumer):
             if self._settings.labels_steps:
                 while not self._labelled(phase):
                     yield None
+                self._applied = phase + 1
                 for _, part in sorted(self._labels.pop(phase).items()):
                     self._counters['labels of evicted steps'] += memory.apply(part)
             for values in learner.train(phase, memory):

@@ -95,10 +95,14 @@ class Membership:
         """Seconds to wait for peers; 0: for ever."""
         return float(self.values['peer_deadline'])
 
+    @property
+    def limit(self) -> Limit:
+        """How long this node waits for others."""
+        return Limit(self.deadline, self.deadline_is, self.again)
+
     def patience(self, topics: Sequence[str]) -> Patience:
         """What watches over this node while it waits for records on these topics."""
-        limit = Limit(self.deadline, self.deadline_is, self.again)
-        return Patience(self.link.full_name, self.peers, topics, limit, self.log)
+        return Patience(self.link.full_name, self.peers, topics, self.limit, self.log)
 
     def introduce(self) -> None:
         """Declare the node's own parameters, and subscribe to presences and runs.

@@ -17,8 +17,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from codetr_ros.bags.first_labels import FirstLabels
 from codetr_ros.bags.topics import BagTopic
 from codetr_ros.bags.writer import McapWriter
-from codetr_ros.nodes.errors import NodeError
-from codetr_ros.nodes.patience import GRACE
+from codetr_ros.nodes.settling import Settling, still_missing
 from codetr_ros.records import TOPICS, Commit, Presence, Record, RecordError, RunSpec, StepRewards
 from codetr_ros.records.checks import check_run
 from codetr_ros.records.fields import type_name
@@ -48,6 +47,7 @@ class Recording(Wiring):
         self._first = FirstLabels(settings) if settings.record_relabels == 'first' else None
         self._bag: McapWriter | None = None
         self._recorded: Counter[str] = Counter()
+        self._settling = Settling(member.link.full_name, member.peers, member.limit)
         self._flush_seconds = self._longest_flush = 0.0
         self._flushes: deque[float] = deque(maxlen=FLUSHES)  # seconds, the newest
 
@@ -135,51 +135,19 @@ class Recording(Wiring):
         self._last.commit(given, raw)
         link.send(TOPICS[Commit], message)
 
-    def _still_missing(self) -> dict[str, int]:
-        member = self.member
-        due = member.peers.published()
-        ours = published_by(member.role)
-        due.update({t: n for t, n in member.link.published.items() if t in ours})
-        commits = TOPICS[Commit]
-        arrived = member.traffic.received + Counter({commits: self._recorded[commits]})
-        return {
-            topic: n - arrived[topic] for topic, n in sorted(due.items()) if n > arrived[topic]
-        }
-
     def settled(self, seconds: float) -> bool:
         """Whether all nodes have finished and all their records are in the bag.
 
         Raises:
             NodeError: a node has ended too early, or records never arrived.
         """
-        peers, deadline = self.member.peers, self.member.deadline
-        now = time.monotonic()
-        newest = [p for p in peers.newest() if not (p.failed and now - p.received_at > GRACE)]
-        present = [p.presence for p in newest if not p.presence.finished]
-        running = [f'{p.role} {p.node}' for p in present]
-        missing = self.member.traffic.lost_for_good = self._still_missing()
-        if not running and not missing:
-            if failed := peers.failed():
-                raise NodeError(
-                    f'{self.member.link.full_name}: every phase is recorded, but '
-                    f'{"; ".join(failed)}, and the bag lacks what was still to come from there. '
-                    'Look at the log of that node'
-                )
-            return True
-        lacking = [f'{n} of {topic}' for topic, n in missing.items()]
-        self.member.doing = (
-            f'waits for the end of {", ".join(running) or "nobody"} '
-            f'and for {", ".join(lacking) or "nothing"}'
-        )
-        # a node that still publishes its presence may work as long as it needs
-        newest_at = max((p.received_at for p in peers.by_instance.values()), default=0.0)
-        silent = now - newest_at
-        if deadline and min(seconds, silent) > deadline:
-            raise NodeError(
-                f'{self.member.link.full_name} gave up after {deadline:g} s: {self.member.doing}. '
-                'The bag lacks that'
-            )
-        return False
+        member = self.member
+        ours = {t: n for t, n in member.link.published.items() if t in published_by(member.role)}
+        commits = {TOPICS[Commit]: self._recorded[TOPICS[Commit]]}
+        missing = still_missing(member.peers.published(), ours, member.traffic.received, commits)
+        member.traffic.lost_for_good = missing
+        settled, member.doing = self._settling.check(missing, seconds, time.monotonic())
+        return settled
 
     def close(self) -> None:
         """Finish the bag."""

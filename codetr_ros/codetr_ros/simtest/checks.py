@@ -1,0 +1,103 @@
+"""What must be true of every simulated run, whatever happened in it."""
+
+from collections import Counter
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from codetr_ros.bags.errors import BagError
+from codetr_ros.bags.verify import Verdict, verify
+from codetr_ros.nodes import errors
+from codetr_ros.records import TOPICS, Commit, CompositeReward, StepRewards, Transitions
+from codetr_ros.simtest.disks import TroubledDisk
+from codetr_ros.simtest.process import Process
+
+if TYPE_CHECKING:
+    from codetr_ros.simtest.run import Simulated
+
+COUNTED = tuple(TOPICS[kind] for kind in (Transitions, CompositeReward, StepRewards))
+"""Topics of which every repeated message must be counted by a core that takes it."""
+OF_A_CUT = {'file', 'metadata', 'index'}
+"""Kinds of findings that a bag may have that was not closed."""
+
+
+def early_commit(kind: type, raw: bytes, reader: Process, disk: TroubledDisk) -> str | None:
+    """A commit that arrives before it would outlast a loss of power, in words."""
+    if kind is not Commit or disk.holds(raw):
+        return None
+    return f'a commit reaches {reader.name} before it is on the disk'
+
+
+def at_the_end(run: 'Simulated') -> list[str]:
+    """What is wrong after a run."""
+    processes = list(run.processes.values())
+    found = [*_unexplained(processes)]
+    gave_up = [p for p in processes if not p.finished]
+    if gave_up and run.plan.heals:
+        reasons = '; '.join(f'{p.name}: {p.error}' for p in gave_up)
+        found.append(f'gave up, though nothing happened that the run cannot mend: {reasons}')
+    found += _weights(run)
+    found += _uncounted(processes)
+    found += _bag(run, whole=not gave_up)
+    return found
+
+
+def _unexplained(processes: list[Process]) -> Iterator[str]:
+    """Errors that are no refusals but faults of the program, and ends without a reason."""
+    for each in processes:
+        if each.error is not None and not errors.explains_itself(each.error):
+            yield f'{each.name} fails by a fault: {type(each.error).__name__}: {each.error}'
+        if not each.finished and each.error is None:
+            yield f'{each.name} has ended and names no cause'
+
+
+def _weights(run: 'Simulated') -> Iterator[str]:
+    """Learner and reward node, wherever they finished, have the weights of the undisturbed run."""
+    from codetr_ros.simtest.run import undisturbed
+
+    expected = undisturbed(run.plan.settings.canonical())
+    for name, field in (('learner', 'policy_sha256'), ('reward', 'reward_model_sha256')):
+        process = run.processes.get(name)
+        if process is None or not process.core.finished:
+            continue
+        have = getattr(process.core.report(), field)
+        want = expected.policy if name == 'learner' else expected.reward_model
+        if have != want:
+            yield f'{name} ends with other weights: {field} is {have}, undisturbed {want}'
+
+
+def _uncounted(processes: list[Process]) -> Iterator[str]:
+    """Messages that came twice, and that a core neither counts nor refuses."""
+    for each in processes:
+        if each.error is not None:
+            continue
+        counted = Counter(each.core.duplicated) + each.traffic.refused + each.core.refused
+        read = {TOPICS[kind] for kind in each.core.subscribes}
+        for topic in COUNTED:
+            if topic in read and each.repeated[topic] > counted[topic]:
+                yield (
+                    f'{each.name} has taken {each.repeated[topic]} repeated messages on {topic}, '
+                    f'and counts {counted[topic]}'
+                )
+
+
+def _bag(run: 'Simulated', whole: bool) -> Iterator[str]:
+    """The bag holds what was learnt from, and is sound if the run has finished."""
+    try:
+        verdict = verify(run.folder)
+    except BagError as error:
+        if whole:
+            yield f'the bag cannot be read: {error}'
+        return
+    yield from _findings(verdict, whole)
+
+
+def _findings(verdict: Verdict, whole: bool) -> Iterator[str]:
+    allowed = set() if whole else OF_A_CUT
+    for finding in verdict.findings.named:
+        # a commit does not wait for true rewards, from which nobody learns
+        cut_off = not whole and finding.text.endswith('have no true rewards')
+        if finding.kind not in allowed and not cut_off:
+            yield f'the bag is not sound: {finding.kind}: {finding.text}'
+    for run in verdict.runs.values():
+        if run.whole != run.phases:
+            yield f'of {run.phases} committed phases in the bag {run.whole} are whole'

@@ -1,0 +1,90 @@
+"""A disk that is full, fails to sync, or loses what was not synced."""
+
+import errno
+import io
+import os
+import random
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+from codetr_ros.system.disk import Disk
+
+ROOM = 1 << 30  # bytes free on a disk that is not full
+
+
+@dataclass
+class Trouble:
+    """What is wrong with a disk.
+
+    Attributes:
+        room: bytes that can be written before it is full; None: any number.
+        syncs: how many times it syncs before that fails; None: always.
+    """
+
+    room: int | None = None
+    syncs: int | None = None
+
+
+class _File(io.FileIO):
+    """A file on such a disk: writes what there is room for, even a part of what it is given."""
+
+    def __init__(self, path: Path, trouble: Trouble) -> None:
+        super().__init__(path, 'xb')
+        self._trouble = trouble
+
+    def write(self, data: bytes) -> int:  # type: ignore[override]
+        room = self._trouble.room
+        if room is None:
+            return super().write(data)
+        done = super().write(memoryview(data)[:room]) if room else 0
+        self._trouble.room = room - done
+        if done < len(data):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return done
+
+
+@dataclass
+class TroubledDisk(Disk):
+    """A disk whose troubles are foreseen.
+
+    Attributes:
+        trouble: what is wrong with it.
+        synced: bytes of each file that would outlast a loss of power.
+    """
+
+    trouble: Trouble = field(default_factory=Trouble)
+    synced: dict[Path, int] = field(default_factory=dict)
+    _paths: dict[int, Path] = field(default_factory=dict)
+
+    def create(self, path: Path) -> BinaryIO:
+        """Open a new file."""
+        file = io.BufferedWriter(_File(path, self.trouble))  # type: ignore[type-var]
+        self.synced[path] = 0
+        self._paths[id(file)] = path
+        return file
+
+    def sync(self, file: BinaryIO) -> None:
+        """Make what was written so far outlast a loss of power."""
+        file.flush()
+        if self.trouble.syncs is not None:
+            if self.trouble.syncs <= 0:
+                raise OSError(errno.EIO, os.strerror(errno.EIO))
+            self.trouble.syncs -= 1
+        self.synced[self._paths[id(file)]] = file.tell()
+
+    def free(self, folder: Path) -> int:
+        """The bytes left."""
+        return ROOM if self.trouble.room is None else self.trouble.room
+
+    def holds(self, data: bytes) -> bool:
+        """Whether these bytes would outlast a loss of power."""
+        return any(
+            data in path.read_bytes()[:size] for path, size in self.synced.items() if path.exists()
+        )
+
+    def lose_power(self, rng: random.Random) -> None:
+        """Cut what was not synced: all of it, none, or anywhere between."""
+        for path, size in self.synced.items():
+            if path.exists() and (there := path.stat().st_size) > size:
+                os.truncate(path, rng.choice((size, there, rng.randint(size, there))))

@@ -1,0 +1,61 @@
+"""Brings what nodes publish to those that read it, over the simulated network."""
+
+from collections.abc import Callable, Mapping
+
+from codetr_ros.records import Presence
+from codetr_ros.simtest.network import Handle, Network, Weather
+from codetr_ros.simtest.process import Packet, Process
+from codetr_ros.simtest.recording import RECORDED
+from codetr_ros.simtest.world import World
+
+Watch = Callable[[type, bytes, Process], None]
+"""Looks at a message that arrives at a node."""
+
+
+class Post:
+    """Knows who reads what.
+
+    Attributes:
+        processes: the nodes, by name.
+        watch: looks at every message when it arrives.
+        network: carries the messages.
+
+    Args:
+        world: where it is.
+        weather: how the network behaves.
+    """
+
+    def __init__(self, world: World, weather: Weather) -> None:
+        self.processes: Mapping[str, Process] = {}
+        self.watch: Watch = lambda kind, raw, reader: None
+        self.network = Network(world, weather)
+
+    def _reads(self, reader: Process, kind: type) -> bool:
+        if kind is Presence:
+            return True
+        return kind in RECORDED if reader.role == 'record' else kind in reader.core.subscribes
+
+    def publish(self, sender: Process, packet: Packet) -> None:
+        """Send a message to everybody who reads its kind; the recorder reads its own too."""
+        kind = packet.kind
+        ours = kind is Presence or kind.__name__ == 'Commit'  # the recorder has written it
+        readers = [
+            each.name
+            for each in self.processes.values()
+            if self._reads(each, kind) and not (each is sender and ours)
+        ]
+        self.network.publish(sender.name, readers, kind, lambda name: self._arrives(name, packet))
+
+    def send(self, sender: Process, reader: str, packet: Packet) -> None:
+        """Send a request or an answer to one node."""
+        self.network.send(sender.name, reader, packet.kind, self._arrives(reader, packet), True)
+
+    def _arrives(self, name: str, packet: Packet) -> Handle:
+        reader = self.processes[name]
+
+        def handle() -> None:
+            if isinstance(packet.data, bytes):
+                self.watch(packet.kind, packet.data, reader)
+            reader.arrive(packet)
+
+        return handle

@@ -1,0 +1,203 @@
+"""What happens in a simulated run: its settings and its troubles, all drawn from a seed."""
+
+import random
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+from codetr_ros.config import Settings
+from codetr_ros.simtest.disks import Trouble
+from codetr_ros.simtest.network import LEASE, Partition, Weather
+from codetr_ros.simtest.process import Pace
+from codetr_ros.simtest.task import TASK
+
+DEADLINE = 60.0
+"""How long a node waits for others [s of virtual time]: the default of `peer_deadline`."""
+BUSY = 8.0
+"""Troubles begin within so many seconds, which a run without troubles takes at most."""
+
+_SMALL: dict[str, Any] = {
+    'task': TASK,
+    'delay': 3,
+    'steps': 24,
+    'phase_steps': 8,
+    'warmup_steps': 8,
+    'evaluate_every': 8,
+    'evaluate_episodes': 1,
+    'memory_steps': 20,  # fewer than the run has: whole episodes leave
+    'threads': '1',
+    'sac.compile': False,
+    'sac.hidden': (4,),
+    'sac.batch': 4,
+    'rrd.hidden': (4,),
+    'rrd.subsequences': 2,
+    'rrd.subsequence_steps': 2,
+    'rrd.first_gradient_steps': 2,
+    'rrd.gradient_steps': 1,
+}
+_CHANGES: tuple[dict[str, Any], ...] = (
+    {'method': 'none'},
+    {'method': 'uniform', 'simulators': 2},
+    {'method': 'rrd'},
+    {'method': 'evidence', 'simulators': 2},
+    {'method': 'none', 'overlap': True},
+    {'method': 'rrd', 'overlap': True, 'simulators': 2},
+    {'method': 'uniform', 'envs': 2, 'delay': '2:4'},
+    {'method': 'uniform', 'simulators': 4, 'delay': 'episode', 'evaluate_every': 0},
+)
+
+
+@cache
+def all_settings() -> tuple[Settings, ...]:
+    """The runs that are simulated: as small as they can be, and different."""
+    return tuple(Settings().changed(_SMALL | changes) for changes in _CHANGES)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A simulated run and its troubles.
+
+    Attributes:
+        seed: from which all of it is drawn.
+        settings: of the run.
+        weather: how the network behaves.
+        paces: how quickly each node works, by name.
+        disk: what is wrong with the recorder's disk.
+        heals: whether the run must end as if nothing had happened; else it may also end by an
+            error that names its cause.
+    """
+
+    seed: int
+    settings: Settings
+    weather: Weather
+    paces: dict[str, Pace]
+    disk: Trouble = field(default_factory=Trouble)
+    heals: bool = True
+
+    @property
+    def calm(self) -> bool:
+        """Whether messages only take their time, and nothing else happens."""
+        weather = self.weather
+        return not (
+            weather.doubled
+            or weather.lost
+            or weather.partitions
+            or any(pace.stalls for pace in self.paces.values())
+            or self.disk != Trouble()
+        )
+
+    @property
+    def longest(self) -> float:
+        """When even the longest wait must have ended [s]."""
+        stalls = sum(length for pace in self.paces.values() for _, length in pace.stalls)
+        partitions = sum(each.seconds for each in self.weather.partitions)
+        return 20 * BUSY + 6 * DEADLINE + stalls + partitions
+
+    def in_words(self) -> list[str]:
+        """What is planned, for people."""
+        settings, weather = self.settings, self.weather
+        lines = [
+            f'method {settings.method}, {settings.simulators} simulators of {settings.envs}, '
+            f'overlap {settings.overlap}, delay {settings.delay}',
+            f'messages take {weather.delay:g} s'
+            f'{", overtake each other" if weather.reorder else ""}, {weather.doubled:.0%} arrive '
+            f'twice, {weather.lost:.0%} of what can be fetched again never',
+        ]
+        lines += [
+            f'from {p.begin:.1f} s for {p.seconds:.1f} s {", ".join(sorted(p.apart))} and the '
+            'others do not reach each other'
+            for p in weather.partitions
+        ]
+        for name, pace in self.paces.items():
+            if pace.begins > 1:
+                lines.append(f'{name} starts at {pace.begins:.1f} s')
+            if pace.slice_seconds > 0.5:
+                lines.append(f'{name} takes {pace.slice_seconds:.1f} s for a slice')
+            lines += [f'{name} stalls at {a:.1f} s for {b:.1f} s' for a, b in pace.stalls]
+        if self.disk.room is not None:
+            lines.append(f'the disk of the recorder has room for {self.disk.room} bytes')
+        if self.disk.syncs is not None:
+            lines.append(f'the disk of the recorder syncs {self.disk.syncs} times')
+        lines.append('must end as if nothing had happened' if self.heals else 'may fail by name')
+        return lines
+
+
+def names_of(settings: Settings) -> dict[str, str]:
+    """The nodes of a run: role by name."""
+    roles = dict.fromkeys(settings.simulator_names, 'sim')
+    return roles | {role: role for role in settings.roles if role != 'sim'}
+
+
+def plan(seed: int) -> Plan:
+    """Draw a run and its troubles."""
+    rng = random.Random(f'plan {seed}')
+    choices = all_settings()
+    settings = choices[seed % len(choices)]
+    names = list(names_of(settings))
+    some = _Drawn(rng)
+    partitions = tuple(_partition(rng, names) for _ in range(some.number(0.3)))
+    weather = Weather(
+        delay=rng.choice((0.001, 0.02, 0.3)),
+        reorder=some.happens(0.5),
+        doubled=some.share(0.4),
+        lost=some.share(0.4),
+        partitions=partitions,
+    )
+    paces = {
+        name: Pace(
+            begins=rng.uniform(0, 30) if some.happens(0.1) else rng.uniform(0, 1),
+            slice_seconds=rng.uniform(0.5, 2) if some.happens(0.1) else 0.02,
+            stalls=[_stall(rng) for _ in range(some.number(0.1))],
+        )
+        for name in names
+    }
+    disk = Trouble()
+    if some.happens(0.06):
+        disk.room = rng.randint(0, 60_000)
+    if some.happens(0.06):
+        disk.syncs = rng.randint(0, 6)
+    silent = sum(each.seconds for each in partitions)
+    silent += sum(length for pace in paces.values() for _, length in pace.stalls)
+    heals = (
+        disk == Trouble()
+        and all(each.seconds <= LEASE for each in partitions)
+        and silent < DEADLINE / 2
+    )
+    return Plan(seed, settings, weather, paces, disk, heals)
+
+
+class _Drawn:
+    """Draws whether and how much."""
+
+    def __init__(self, rng: random.Random) -> None:
+        self._rng = rng
+
+    def happens(self, probability: float) -> bool:
+        """Whether something happens."""
+        return self._rng.random() < probability
+
+    def share(self, probability: float) -> float:
+        """0, or with a probability a share up to a third."""
+        return self._rng.uniform(0.01, 0.35) if self.happens(probability) else 0.0
+
+    def number(self, probability: float) -> int:
+        """How many: each more with a probability."""
+        count = 0
+        while count < 3 and self.happens(probability):
+            count += 1
+        return count
+
+
+def _length(rng: random.Random) -> float:
+    """Seconds of a partition or stall: often short, sometimes beyond every deadline."""
+    least, most = rng.choice(((0.1, 2), (0.1, 2), (2, 15), (2, 15), (15, 50), (50, 200)))
+    return rng.uniform(least, most)
+
+
+def _partition(rng: random.Random, names: list[str]) -> Partition:
+    apart = frozenset(rng.sample(names, rng.randint(1, len(names) - 1)))
+    return Partition(rng.uniform(0, BUSY), _length(rng), apart)
+
+
+def _stall(rng: random.Random) -> tuple[float, float]:
+    return rng.uniform(0, BUSY), _length(rng)

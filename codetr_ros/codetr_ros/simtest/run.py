@@ -1,0 +1,179 @@
+"""One simulated run, and what must be true of it."""
+
+import logging
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import torch
+
+from codetr_ros.config import Settings
+from codetr_ros.cores import in_process
+from codetr_ros.cores.core import Core
+from codetr_ros.cores.evaluator import Evaluator
+from codetr_ros.cores.labeller import Labeller
+from codetr_ros.cores.learner import Learner
+from codetr_ros.cores.recorder import Recorder
+from codetr_ros.cores.simulator import Simulator
+from codetr_ros.nodes import errors
+from codetr_ros.records import Record, RunSpec
+from codetr_ros.runs import folder as run_folder
+from codetr_ros.simtest import checks
+from codetr_ros.simtest.disks import TroubledDisk
+from codetr_ros.simtest.mail import Post
+from codetr_ros.simtest.plan import DEADLINE, Plan, names_of, plan
+from codetr_ros.simtest.process import Process
+from codetr_ros.simtest.recording import Recording
+from codetr_ros.simtest.world import World
+
+RUN_ID = 'simtest'
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a simulated run ended.
+
+    Attributes:
+        plan: what was planned.
+        failures: what is wrong, in words; empty: everything that must be true is.
+        errors: why nodes gave up, by name.
+        seconds: the virtual time that it took [s].
+        trace: the newest events.
+    """
+
+    plan: Plan
+    failures: list[str]
+    errors: dict[str, str]
+    seconds: float
+    trace: list[str]
+
+
+@dataclass(frozen=True)
+class Digests:
+    """The weights that a run ended with."""
+
+    policy: str | None
+    reward_model: str | None
+
+
+@cache
+def undisturbed(canonical: str) -> Digests:
+    """The weights of a run in which nothing happens, in process.
+
+    Args:
+        canonical: its settings, as `Settings.canonical` has them.
+    """
+    reports = in_process.run(Settings.model_validate_json(canonical), RUN_ID)
+    reward = reports.get('reward')
+    return Digests(
+        reports['learner'].policy_sha256, reward.reward_model_sha256 if reward else None
+    )
+
+
+def core_of(role: str, name: str, run: RunSpec, settings: Settings) -> Core[Record]:
+    """The core of a node."""
+    if role == 'sim':
+        return Simulator(run, settings, name)
+    if role == 'record':
+        return Recorder(run, settings, name)
+    if role == 'reward':
+        return Labeller(run, settings, name, None)
+    if role == 'learner':
+        return Learner(run, settings, name, None)
+    return Evaluator(run, settings, name)
+
+
+class Simulated:
+    """A run in a simulated world.
+
+    Args:
+        planned: what will happen.
+        folder: an empty one, for the bag.
+        kept: how many events the trace holds.
+    """
+
+    def __init__(self, planned: Plan, folder: Path, kept: int) -> None:
+        settings = planned.settings
+        self.plan = planned
+        self.folder = folder
+        self.world = World(planned.seed, kept)
+        self.disk = TroubledDisk(planned.disk)
+        self.post = Post(self.world, planned.weather)
+        run = settings.run_spec(RUN_ID)
+        self.processes: dict[str, Process] = {}
+        self.failures: list[str] = []
+        for name, role in names_of(settings).items():
+            common = (
+                self.world, self.post, run, settings, role, name,
+                core_of(role, name, run, settings), planned.paces[name], DEADLINE,
+            )  # fmt: skip
+            try:
+                made = (
+                    Recording(*common, folder=folder, disk=self.disk, lag=settings.lag)
+                    if role == 'record'
+                    else Process(*common)
+                )
+            except Exception as error:  # noqa: BLE001 - a disk that is full from the beginning
+                made = Process(*common)
+                made.error = error
+            self.processes[name] = made
+        self.post.processes = self.processes
+        self.post.watch = self._watch
+        for each in self.processes.values():
+            if each.error is not None:
+                each.end()
+
+    def _watch(self, kind: type, raw: bytes, reader: Process) -> None:
+        """Look at what arrives at a consumer."""
+        if found := checks.early_commit(kind, raw, reader, self.disk):
+            self.failures.append(found)
+
+    def run(self) -> Outcome:
+        """Let it happen, and judge it."""
+        processes = self.processes.values()
+        over = self.world.run(
+            self.plan.longest, lambda: bool(self.failures) or all(p.ended for p in processes)
+        )
+        for each in processes:
+            each.core.close()
+        if not over:
+            waiting = [f'{p.name} {p.doing}' for p in processes if not p.ended]
+            self.failures.append(
+                f'stuck at {self.world.now:.0f} s: nobody ends the wait: {"; ".join(waiting)}'
+            )
+        if not self.failures:
+            self.failures += checks.at_the_end(self)
+        gave_up = {p.name: errors.in_words(p.error) for p in processes if p.error is not None}
+        return Outcome(self.plan, self.failures, gave_up, self.world.now, self.world.trace())
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without what the library logs: refusals are planned here."""
+    before = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logging.disable(before)
+
+
+def simulate(seed: int, kept: int = 400) -> Outcome:
+    """Simulate the run of a seed, and judge it.
+
+    Args:
+        seed: from which the run and all its troubles are drawn.
+        kept: how many of the newest events the trace holds.
+    """
+    torch.set_num_threads(1)
+    planned = plan(seed)
+    with tempfile.TemporaryDirectory(prefix='codetr_simtest_', dir=_memory()) as folder, _quiet():
+        return Simulated(planned, Path(folder) / run_folder.BAG, kept).run()
+
+
+def _memory() -> str | None:
+    """A folder in memory, where the machine has one."""
+    return '/dev/shm' if Path('/dev/shm').is_dir() else None

@@ -1,0 +1,76 @@
+"""Runs in which messages, disks and nodes fail end as if nothing had happened, or by name."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from codetr_ros.simtest.plan import all_settings, plan
+from codetr_ros.simtest.run import simulate
+
+QUICK, MANY = range(24), range(24, 200)
+
+
+def failures(seeds):
+    return {seed: found for seed in seeds if (found := simulate(seed).failures)}
+
+
+def test_a_few_seeds_end_as_if_nothing_had_happened_or_by_name():
+    assert failures(QUICK) == {}
+
+
+@pytest.mark.slow
+def test_some_hundred_seeds_end_as_if_nothing_had_happened_or_by_name():
+    assert failures(MANY) == {}
+
+
+def test_seeds_draw_every_kind_of_run_and_every_kind_of_trouble():
+    plans = [plan(seed) for seed in MANY]
+    assert {each.settings.hash() for each in plans} == {s.hash() for s in all_settings()}
+    for happens in (
+        lambda p: p.weather.doubled,
+        lambda p: p.weather.lost,
+        lambda p: p.weather.reorder,
+        lambda p: p.weather.partitions,
+        lambda p: any(pace.stalls for pace in p.paces.values()),
+        lambda p: p.disk.room is not None,
+        lambda p: p.disk.syncs is not None,
+        lambda p: p.calm,
+        lambda p: not p.heals,
+    ):
+        count = sum(bool(happens(each)) for each in plans)
+        assert 3 < count < len(plans)
+
+
+def test_a_run_that_cannot_be_mended_ends_by_errors_that_name_a_cause():
+    ended = [simulate(seed) for seed in (36, 39)]  # the disk fails to sync; it is full
+    assert ['Input/output error' in each.errors['record'] for each in ended] == [True, False]
+    assert 'No space left on device' in ended[1].errors['record']
+    assert all('record /record' in each.errors['learner'] for each in ended)
+    assert [each.failures for each in ended] == [[], []]
+
+
+PROGRAM = """
+import sys
+from codetr_ros.simtest.run import simulate
+outcome = simulate(3)
+print(outcome.seconds, outcome.errors, *outcome.trace, sep='\\n')
+"""
+
+
+def test_a_seed_gives_the_same_run_to_the_last_event_in_another_process_too():
+    texts = []
+    for hash_seed in ('1', '2'):  # which decides the order of sets
+        environment = os.environ | {'PYTHONHASHSEED': hash_seed}
+        done = subprocess.run(
+            [sys.executable, '-c', PROGRAM],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=120,
+        )
+        texts.append(done.stdout)
+    assert len(texts[0].splitlines()) > 100
+    assert texts[0] == texts[1]
