@@ -161,6 +161,23 @@ def test_the_learner_waits_for_all_parts_of_the_labels_before_it_learns():
     assert dict(zip(metrics.names, metrics.values, strict=True))['labelled_steps'] == 10
 
 
+def test_labels_that_come_again_while_the_learner_learns_from_them_are_counted_and_dropped():
+    settings = tiny(method='uniform')
+    core = Learner(run(settings), settings, 'learner', None)
+    core.receive(task_spec())
+    episode = Endless(settings)
+    work = core.work()
+    for phase in range(2):
+        episode.phase(core, phase)
+    slices(work)
+    labels = step_rewards(phase=1, parts=1)
+    core.receive(labels)
+    assert next(work) == []  # the first burst of updates
+    core.receive(labels)
+    assert core.duplicated == {'step_rewards': 1}
+    assert core._labels == {}  # nothing is held for ever
+
+
 def test_nothing_is_learnt_while_nothing_is_labelled_and_that_is_counted():
     core, settings = learner()
     episode = Endless(settings)

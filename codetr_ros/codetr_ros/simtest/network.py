@@ -104,7 +104,8 @@ class Network:
             return
         arrival = begin + world.rng.expovariate(1 / weather.delay)
         if ordered or not weather.reorder:
-            key = sender, reader, kind
+            # until a recorder holds steps of sources that have not announced themselves
+            key = sender, reader, Transitions if ordered and kind is TaskSpec else kind
             arrival = self._last[key] = max(arrival, self._last.get(key, 0.0))
         world.at(arrival, handle)
         twice = kind in TOPICS and (kind in FETCHED_AGAIN or not ordered)
