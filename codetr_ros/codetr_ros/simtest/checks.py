@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+from codetr_ros.bags.definitions import decode
 from codetr_ros.bags.errors import BagError
 from codetr_ros.bags.verify import Verdict, verify
 from codetr_ros.nodes import errors
@@ -16,13 +17,14 @@ if TYPE_CHECKING:
 
 COUNTED = tuple(TOPICS[kind] for kind in (Transitions, CompositeReward, StepRewards))
 """Topics of which every repeated message must be counted by a core that takes it."""
-OF_A_CUT = {'file', 'metadata', 'index'}
-"""Kinds of findings that a bag may have that was not closed."""
+OF_A_CUT = ('without its index: its writer was killed', 'have no true rewards')
+"""What a bag may lack that was not closed. A commit does not wait for true rewards, from which
+nobody learns."""
 
 
 def early_commit(kind: type, raw: bytes, reader: Process, disk: TroubledDisk) -> str | None:
     """A commit that arrives before it would outlast a loss of power, in words."""
-    if kind is not Commit or disk.holds(raw):
+    if kind is not Commit or disk.holds(raw) or decode(kind, raw).run_id != reader.run.run_id:
         return None
     return f'a commit reaches {reader.name} before it is on the disk'
 
@@ -38,6 +40,8 @@ def at_the_end(run: 'Simulated') -> list[str]:
     found += _weights(run)
     found += _uncounted(processes)
     found += _bag(run, whole=not gave_up)
+    if not gave_up and not run.plan.weather.strangers:
+        found += _unrecorded(run)
     return found
 
 
@@ -80,22 +84,34 @@ def _uncounted(processes: list[Process]) -> Iterator[str]:
                 )
 
 
+def _unrecorded(run: 'Simulated') -> Iterator[str]:
+    """Records that were published in a run that has finished, and are not in its bag."""
+    published: Counter[str] = Counter()
+    for each in run.processes.values():
+        published += each.published
+    recorded = run.recording.recorded
+    for topic, count in published.items():
+        if recorded[topic] != count:
+            yield f'{count} records were published on {topic}, the bag has {recorded[topic]}'
+
+
 def _bag(run: 'Simulated', whole: bool) -> Iterator[str]:
     """The bag holds what was learnt from, and is sound if the run has finished."""
+    allowed = set() if whole else {'metadata', 'index'}
+    if not whole and any(reader == 'record' for reader, _ in run.post.network.lost):
+        allowed |= {'segment', 'record'}  # of steps that never reached it
     try:
         verdict = verify(run.folder)
     except BagError as error:
         if whole:
             yield f'the bag cannot be read: {error}'
         return
-    yield from _findings(verdict, whole)
+    yield from _findings(verdict, allowed, whole)
 
 
-def _findings(verdict: Verdict, whole: bool) -> Iterator[str]:
-    allowed = set() if whole else OF_A_CUT
+def _findings(verdict: Verdict, allowed: set[str], whole: bool) -> Iterator[str]:
     for finding in verdict.findings.named:
-        # a commit does not wait for true rewards, from which nobody learns
-        cut_off = not whole and finding.text.endswith('have no true rewards')
+        cut_off = not whole and any(text in finding.text for text in OF_A_CUT)
         if finding.kind not in allowed and not cut_off:
             yield f'the bag is not sound: {finding.kind}: {finding.text}'
     for run in verdict.runs.values():

@@ -1,13 +1,17 @@
 """Brings what nodes publish to those that read it, over the simulated network."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
+from codetr_ros.bags.definitions import decode, encode
 from codetr_ros.records import Presence
 from codetr_ros.simtest.network import Handle, Network, Weather
 from codetr_ros.simtest.process import Packet, Process
 from codetr_ros.simtest.recording import RECORDED
 from codetr_ros.simtest.world import World
 
+STRANGER = 'stranger'
+"""The run of messages that are of another one."""
 Watch = Callable[[type, bytes, Process], None]
 """Looks at a message that arrives at a node."""
 
@@ -29,6 +33,8 @@ class Post:
         self.processes: Mapping[str, Process] = {}
         self.watch: Watch = lambda kind, raw, reader: None
         self.network = Network(world, weather)
+        self._world = world
+        self._weather = weather
 
     def _reads(self, reader: Process, kind: type) -> bool:
         if kind is Presence:
@@ -45,6 +51,10 @@ class Post:
             if self._reads(each, kind) and not (each is sender and ours)
         ]
         self.network.publish(sender.name, readers, kind, lambda name: self._arrives(name, packet))
+        if kind is not Presence and self._world.rng.random() < self._weather.strangers:
+            strange = replace(decode(kind, packet.data), run_id=STRANGER)
+            other = Packet(kind, self._world.number(), encode(strange))
+            self.network.publish(STRANGER, readers, kind, lambda name: self._arrives(name, other))
 
     def send(self, sender: Process, reader: str, packet: Packet) -> None:
         """Send a request or an answer to one node."""

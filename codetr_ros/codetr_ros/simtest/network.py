@@ -52,6 +52,8 @@ class Weather:
         reorder: whether messages overtake each other on the way to all but the recorder.
         doubled: share of messages that arrive twice.
         lost: share of those messages that never arrive which a reader can fetch again.
+        overrun: share of those messages that never arrive at the recorder.
+        strangers: share of messages that arrive once more, as if they were of another run.
         partitions: when it falls into parts.
     """
 
@@ -59,6 +61,8 @@ class Weather:
     reorder: bool = False
     doubled: float = 0.0
     lost: float = 0.0
+    overrun: float = 0.0
+    strangers: float = 0.0
     partitions: tuple[Partition, ...] = ()
 
 
@@ -97,8 +101,8 @@ class Network:
         world, weather = self._world, self._weather
         topic = TOPICS.get(kind, kind.__name__)
         begin = self._through(sender, reader, kind)
-        may_be_lost = kind in FETCHED_AGAIN and not ordered
-        if begin is None or (may_be_lost and world.rng.random() < weather.lost):
+        losing = (weather.overrun if ordered else weather.lost) if kind in FETCHED_AGAIN else 0.0
+        if begin is None or (losing and world.rng.random() < losing):
             self.lost[reader, topic] += 1
             world.note(sender, f'{topic} to {reader} is lost')
             return

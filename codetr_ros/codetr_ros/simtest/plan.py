@@ -81,6 +81,8 @@ class Plan:
         return not (
             weather.doubled
             or weather.lost
+            or weather.overrun
+            or weather.strangers
             or weather.partitions
             or any(pace.stalls for pace in self.paces.values())
             or self.disk != Trouble()
@@ -103,6 +105,10 @@ class Plan:
             f'{", overtake each other" if weather.reorder else ""}, {weather.doubled:.0%} arrive '
             f'twice, {weather.lost:.0%} of what can be fetched again never',
         ]
+        if weather.overrun:
+            lines.append(f'{weather.overrun:.0%} of those never arrive at the recorder')
+        if weather.strangers:
+            lines.append(f'{weather.strangers:.0%} come once more as of another run')
         lines += [
             f'from {p.begin:.1f} s for {p.seconds:.1f} s {", ".join(sorted(p.apart))} and the '
             'others do not reach each other'
@@ -141,6 +147,8 @@ def plan(seed: int) -> Plan:
         reorder=some.happens(0.5),
         doubled=some.share(0.4),
         lost=some.share(0.4),
+        overrun=0.03 if some.happens(0.06) else 0.0,
+        strangers=0.05 if some.happens(0.2) else 0.0,
         partitions=partitions,
     )
     paces = {
@@ -160,6 +168,7 @@ def plan(seed: int) -> Plan:
     silent += sum(length for pace in paces.values() for _, length in pace.stalls)
     heals = (
         disk == Trouble()
+        and not weather.overrun
         and all(each.seconds <= LEASE for each in partitions)
         and silent < DEADLINE / 2
     )

@@ -9,7 +9,8 @@ from codetr_ros.bags.topics import BagTopic
 from codetr_ros.bags.writer import McapWriter
 from codetr_ros.nodes.last_phases import LastPhases
 from codetr_ros.nodes.settling import Settling, still_missing
-from codetr_ros.records import TOPICS, Commit, Presence, Record, RunSpec
+from codetr_ros.records import TOPICS, Commit, Presence, Record, RecordError, RunSpec
+from codetr_ros.records.checks import check_run
 from codetr_ros.records.fields import type_name
 from codetr_ros.records.roles import published_by
 from codetr_ros.simtest.disks import TroubledDisk
@@ -44,11 +45,19 @@ class Recording(Process):
             taken = super().take(kind, raw)
         else:
             self.traffic.received[TOPICS[kind]] += 1
-            taken = True
+            taken = self._is_ours(kind, raw)
         if taken:
             self._write(kind, raw)
             self._last.hold(decode(kind, raw), raw)
         return taken
+
+    def _is_ours(self, kind: type, raw: bytes) -> bool:
+        try:
+            check_run(decode(kind, raw), self.run)
+        except RecordError as error:
+            self.traffic.refuse(kind, error)
+            return False
+        return True
 
     def _take(self, packet: Packet) -> None:
         if isinstance(packet.data, FetchRequest):

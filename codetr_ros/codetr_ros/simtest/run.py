@@ -126,6 +126,13 @@ class Simulated:
             if each.error is not None:
                 each.end()
 
+    @property
+    def recording(self) -> Recording:
+        """The recorder."""
+        recording = self.processes['record']
+        assert isinstance(recording, Recording)
+        return recording
+
     def _watch(self, kind: type, raw: bytes, reader: Process) -> None:
         """Look at what arrives at a consumer."""
         if found := checks.early_commit(kind, raw, reader, self.disk):

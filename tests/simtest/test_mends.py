@@ -1,0 +1,164 @@
+"""What guards a run is needed: with any of it taken out, the simulation finds a seed that fails.
+
+Each mend is a name, a function that takes it out, and words of the failure by which it is found.
+"""
+
+from collections.abc import Callable
+
+import pytest
+
+from codetr_ros.bags import writer
+from codetr_ros.cores import announced, intake, learner, recorder
+from codetr_ros.nodes import fetching, patience, settling
+from codetr_ros.nodes.last_phases import LastPhases
+from codetr_ros.records import TOPICS
+from codetr_ros.simtest.run import simulate
+
+MOST = 150
+"""Seeds that are tried."""
+
+
+def accept_duplicates(patch):
+    def taken(self, record, due, name):
+        due[name] = max(due[name], record.sequence + 1)
+        return True
+
+    patch.setattr(recorder.Recorder, '_next', taken)
+
+
+def accept_gaps(patch):
+    def taken(self, record, due, name):
+        if record.sequence < due[name]:
+            self.duplicated[TOPICS[type(record)]] += 1
+            return False
+        due[name] = record.sequence + 1
+        return True
+
+    patch.setattr(recorder.Recorder, '_next', taken)
+
+
+def hold_what_came_twice(patch):
+    def hold(self, record, held, key, taken):
+        held[key] = record
+
+    patch.setattr(intake.Intake, '_hold', hold)
+
+
+def take_in_by_arrival(patch):
+    def named(self, names, last, held, kind):
+        found = real(self, names, last, held, kind)
+        places = {id(record): place for place, record in enumerate(held.values())}
+        return found and sorted(found, key=lambda record: places[id(record)])
+
+    real = intake.Intake._named
+    patch.setattr(intake.Intake, '_named', named)
+
+
+def train_before_the_commit(patch):
+    def take(self, phase, memory):
+        if phase not in self._commits and self._transitions:
+            for key in sorted(self._transitions):
+                if self._transitions[key].phase == phase:
+                    memory.append(self._transitions.pop(key))
+        return real(self, phase, memory)
+
+    real = intake.Intake.take
+    patch.setattr(intake.Intake, 'take', take)
+
+
+def commit_without_scores(patch):
+    def whole(self, phase):
+        scores, self._scores = (
+            self._scores,
+            self._committed_scores + recorder.Counter(dict.fromkeys(self._scores, 10**6)),
+        )
+        try:
+            return real(self, phase)
+        finally:
+            self._scores = scores
+
+    real = recorder.Recorder._whole
+    patch.setattr(recorder.Recorder, '_whole', whole)
+
+
+def commit_half_a_phase(patch):
+    def whole(self, phase):
+        members = self._permitted.get(phase)
+        return bool(members) and any((phase, source) in self._ended for source in members)
+
+    patch.setattr(recorder.Recorder, '_whole', whole)
+
+
+def flush_without_syncing(patch):
+    patch.setattr(writer.McapWriter, 'flush', lambda self: self._stream.flush())
+
+
+def sync_without_ending_the_chunk(patch):
+    patch.setattr(writer.McapWriter, 'flush', lambda self: self._disk.sync(self._stream))
+
+
+def leave_half_a_chunk(patch):
+    patch.setattr(writer.os, 'truncate', lambda path, size: None)
+
+
+def never_fetch_again(patch):
+    patch.setattr(fetching.Fetching, 'due', lambda self, missing, now: False)
+
+
+def forget_the_last_phases(patch):
+    patch.setattr(LastPhases, 'hold', lambda self, record, raw: None)
+
+
+def never_give_up(patch):
+    patch.setattr(patience.Patience, 'check', lambda self, now, waiting, doing, lost: None)
+
+
+def end_before_all_is_there(patch):
+    patch.setattr(settling.Settling, 'check', lambda self, missing, seconds, now: (True, ''))
+
+
+def take_labels_again(patch):
+    patch.setattr(
+        learner.Learner,
+        '_applied',
+        property(lambda self: 0, lambda self, value: None),
+        raising=False,
+    )
+
+
+def believe_strangers(patch):
+    for module in (announced, intake, recorder, learner):
+        patch.setattr(module, 'check_run', lambda record, run: None)
+
+
+MENDS: dict[Callable, str] = {
+    accept_duplicates: 'other weights|not sound|are whole|gave up|stuck',
+    accept_gaps: 'not sound|are whole|other weights',
+    hold_what_came_twice: 'repeated messages',
+    take_in_by_arrival: 'other weights|gave up',
+    train_before_the_commit: 'other weights|fault|gave up',
+    commit_without_scores: 'not sound|are whole',
+    commit_half_a_phase: 'not sound|are whole|gave up|fault',
+    flush_without_syncing: 'before it is on the disk',
+    sync_without_ending_the_chunk: 'before it is on the disk',
+    leave_half_a_chunk: 'not sound: file',
+    never_fetch_again: 'gave up',
+    forget_the_last_phases: 'gave up',
+    never_give_up: 'stuck',
+    end_before_all_is_there: 'were published on|names no cause|not sound',
+    take_labels_again: 'repeated messages',
+    believe_strangers: 'other weights|not sound|gave up|fault',
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('take_out', MENDS, ids=lambda mend: mend.__name__)
+def test_what_is_taken_out_is_found_missing_by_a_seed(take_out, monkeypatch):
+    with monkeypatch.context() as patch:
+        take_out(patch)
+        outcomes = (simulate(seed) for seed in range(MOST))
+        found = next((outcome for outcome in outcomes if outcome.failures), None)
+    assert found is not None, f'no seed below {MOST} fails'
+    words = MENDS[take_out].split('|')
+    assert any(word in found.failures[0] for word in words), found.failures
+    assert not simulate(found.plan.seed).failures  # the mend mends it
