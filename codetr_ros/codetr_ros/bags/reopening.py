@@ -24,7 +24,7 @@ from codetr_ros.records.fields import type_name
 from codetr_ros.records.names import full_name
 from codetr_ros.system.files import remedy, sync_folder
 
-_PARTIAL = '.partial'
+PARTIAL = '.partial'
 _COMMIT = type_name(Commit)
 
 
@@ -75,7 +75,7 @@ def mend(folder: Path) -> None:
         OSError: the file cannot be written.
     """
     for path in folder.iterdir():
-        if path.suffix == _PARTIAL:  # of a recorder that was killed when it was here
+        if path.suffix == PARTIAL:  # of a recorder that was killed when it was here
             path.unlink()
     while holds_messages(folder):
         path = bag_files(folder, lambda damage: None)[-1]
@@ -92,7 +92,7 @@ def mend(folder: Path) -> None:
 
 def _write_anew(path: Path) -> None:
     """Replace a file by one of its sound messages, with an end."""
-    partial = path.with_name(f'.{path.name}{_PARTIAL}')
+    partial = path.with_name(f'.{path.name}{PARTIAL}')
     new = NewFile(partial, LIBRARY)
     try:
         for message in _sound(path, []):

@@ -3,13 +3,15 @@
 import json
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from codetr_ros.bags.errors import BagError
+from codetr_ros.config import Settings, queues
+from codetr_ros.records import TOPICS, fields
 
 _FOREVER = {'sec': 9223372036, 'nsec': 854775807}
 
@@ -45,6 +47,24 @@ class BagTopic:
     def digest(self) -> str:
         """REP-2016 hash of its type."""
         return type_hash(self.type)
+
+
+def topics_of_run(names: Mapping[type, str], settings: Settings) -> list[BagTopic]:
+    """The topics of a run's records.
+
+    Args:
+        names: the full name of each kind's topic.
+        settings: of the run, which decide how deep queues are.
+    """
+    return [
+        BagTopic(
+            name,
+            fields.type_name(kind),
+            queues.depth(TOPICS[kind], settings),
+            queues.QUALITIES[TOPICS[kind]].transient_local,
+        )
+        for kind, name in names.items()
+    ]
 
 
 @cache

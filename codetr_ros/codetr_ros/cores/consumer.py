@@ -41,6 +41,7 @@ class Consumer(Part, ABC):
     """
 
     role: ClassVar[str]
+    subscribes: tuple[type, ...]
 
     def __init__(
         self,

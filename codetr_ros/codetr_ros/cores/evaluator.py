@@ -64,6 +64,10 @@ class Evaluator(Part):
             self._seen.add(record.version)
             self._count(record.version)
 
+    def has_evaluated(self, version: int) -> bool:
+        """Whether all episodes of a version's evaluation have been restored."""
+        return len(self._done.get(version, ())) == self._settings.evaluate_episodes
+
     def receive(self, record: Record) -> None:
         """Keep a policy whose version is due for evaluation.
 

@@ -135,9 +135,10 @@ class Recorder(Part):
             seconds = time.perf_counter() - began
             step = self._settings.steps_after(phase)
             values = {'phase_seconds': seconds}
+            # the commit last: a bag that ends with it has all of the phase
             yield [
-                self._commit(phase),
                 metrics(self._run.run_id, 'record', self._name, phase, step, values),
+                self._commit(phase),
             ]
             self.phase = phase + 1
         self.finished = True

@@ -15,14 +15,13 @@ from typing import Any
 from rclpy.serialization import deserialize_message, serialize_message
 
 from codetr_ros.bags.first_labels import FirstLabels
-from codetr_ros.bags.topics import BagTopic
+from codetr_ros.bags.topics import topics_of_run
 from codetr_ros.bags.writer import McapWriter
 from codetr_ros.nodes.settling import Settling, still_missing
 from codetr_ros.records import TOPICS, Commit, Presence, Record, RecordError, RunSpec, StepRewards
 from codetr_ros.records.checks import check_run
-from codetr_ros.records.fields import type_name
 from codetr_ros.records.roles import published_by
-from codetr_ros.ros import messages, qos
+from codetr_ros.ros import messages
 from codetr_ros.ros.joining import Joined
 from codetr_ros.ros.membership import Membership
 from codetr_ros.ros.resend import Resender
@@ -58,7 +57,7 @@ class Recording(Wiring):
         if folder:
             self._bag = McapWriter(
                 folder,
-                [self._bag_topic(kind) for kind in self._full],
+                topics_of_run(self._full, settings),
                 split_bytes=round(self.member.values['bag_split_mb'] * 1e6),
                 keep_free=round(self.member.values['bag_keep_free_mb'] * 1e6),
             )
@@ -73,12 +72,6 @@ class Recording(Wiring):
         if self.member.values['bag']:
             return Path(self.member.values['bag'])
         return self.joined.folder and self.joined.folder / run_folder.BAG
-
-    def _bag_topic(self, kind: type) -> BagTopic:
-        topic = TOPICS[kind]
-        durable = qos.QUALITIES[topic].transient_local
-        depth = qos.depth(topic, self.joined.settings)
-        return BagTopic(self._full[kind], type_name(kind), depth, durable)
 
     def take(self, kind: type, raw: bytes) -> None:
         """Write the bytes of a message as they came, and hand the record to the core."""

@@ -14,7 +14,7 @@ import logging
 import os
 import re
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -238,7 +238,12 @@ def _damaged(file: Path, actual: str, stored: str, remedy: str) -> str:
     return f'checkpoint file {file} is damaged: sha256 is {actual}, should be {stored}: {remedy}'
 
 
-def sound(folder: Path, name: str, newest: int | None = None) -> Iterator[Checkpoint]:
+def sound(
+    folder: Path,
+    name: str,
+    newest: int | None = None,
+    log: Callable[[str], None] = _log.error,
+) -> Iterator[Checkpoint]:
     """The checkpoints of this name whose digests are right, newest first. A damaged one is logged
     and passed over.
 
@@ -246,6 +251,7 @@ def sound(folder: Path, name: str, newest: int | None = None) -> Iterator[Checkp
         folder: the folder of the checkpoints.
         name: the name of their owner.
         newest: the highest phase to look at; None: any.
+        log: takes what is wrong with one.
     """
     for path in reversed(_all(folder, name)):
         if newest is not None and phase_of(path) > newest:
@@ -253,7 +259,7 @@ def sound(folder: Path, name: str, newest: int | None = None) -> Iterator[Checkp
         try:
             tensors, meta = load(path)
         except CheckpointError as error:
-            _log.error('%s. The one before it is looked at', error)
+            log(f'{error}. The one before it is looked at')
             continue
         yield Checkpoint(path, phase_of(path), tensors, meta)
 
