@@ -19,6 +19,7 @@ commands:
   label      write a bag with a reward model's step rewards added
   convert    make a bag for `fit` from ordinary topics, by a mapping file
   report     make the report of a run, however it was started, or of a benchmark
+  watch      show a run in the browser, while it lasts or later
   evaluate   evaluate the policy of a run's newest checkpoint
   benchmark  do many runs under one protocol, and make a table of them
   bag        show, check, recover or play a bag
@@ -67,6 +68,12 @@ def _report(arguments: Sequence[str]) -> int:
     return report.main(arguments)
 
 
+def _watch(arguments: Sequence[str]) -> int:
+    from codetr_ros.cli import watch
+
+    return watch.main(arguments)
+
+
 def _benchmark(arguments: Sequence[str]) -> int:
     from codetr_ros.cli import benchmark
 
@@ -104,6 +111,7 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     'convert': _convert,
     'evaluate': _evaluate,
     'report': _report,
+    'watch': _watch,
     'benchmark': _benchmark,
     'bag': _bag,
     'tasks': _tasks,

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from codetr_ros.cli.beside import Beside
 from codetr_ros.records import Record
 from codetr_ros.runs.live import Live
 from codetr_ros.runs.progress import Progress
@@ -18,12 +19,14 @@ class Audience:
         progress: shows how far the run has come.
         live: writes the files that change while the run lasts.
         events: writes TensorBoard's events; None: nobody asked for them.
+        page: serves the page of the run; None: nobody asked for it.
     """
 
     summary: Summary
     progress: Progress
     live: Live
     events: Events | None = None
+    page: Beside | None = None
 
     def receive(self, record: Record) -> None:
         """Hand on a record."""
@@ -37,6 +40,8 @@ class Audience:
         """Show what has changed, where it is time. Call it now and then."""
         self.progress.tick()
         self.live.tick()
+        if self.page is not None:
+            self.page.tick()
 
     def end(self) -> None:
         """Write what is left of the events."""

@@ -8,6 +8,7 @@ import shlex
 import time
 import traceback
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING
 from codetr_ros import config
 from codetr_ros.cli import FAILED, INTERRUPTED, refuse, results
 from codetr_ros.cli.audience import Audience
+from codetr_ros.cli.beside import Beside
 from codetr_ros.cli.flags import parse
 from codetr_ros.cli.terminal import console
 from codetr_ros.cli.train_flags import FLAGS, PEER_DEADLINE, wrong
@@ -66,10 +68,12 @@ class Shown:
     Attributes:
         film: the robot in the report, if it can be drawn here.
         tensorboard: events for TensorBoard.
+        watch: a page in the browser.
     """
 
     film: bool = False
     tensorboard: bool = False
+    watch: bool = False
 
 
 @dataclasses.dataclass
@@ -138,7 +142,7 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
     run_id = f'r{stamp.replace("-", "_")}_{secrets.token_hex(2)}'
     topics = None if in_process else Topics(extra['namespace'], extra['peer_deadline'], start)
     command = shlex.join(['codetr', 'train', *arguments])
-    shown = Shown(extra['film'], extra['tensorboard'])
+    shown = Shown(extra['film'], extra['tensorboard'], extra['watch'])
     return train(settings, run_id, folder, topics, command, shown)
 
 
@@ -191,8 +195,9 @@ def train(
     events = None
     if shown.tensorboard:
         events = Events(folder / run_folder.TENSORBOARD, settings, progress.log)
-    audience = Audience(summary, progress, live, events)
-    with Interrupts() as interrupts:
+    page = Beside(folder, progress.log) if shown.watch else None
+    audience = Audience(summary, progress, live, events, page)
+    with Interrupts() as interrupts, page or nullcontext():
         with progress:
             way = _in_process if topics is None else partial(_over_topics, topics)
             outcome = way(settings, run_id, folder, audience, interrupts)
@@ -230,7 +235,7 @@ def _in_process(
     def tick() -> None:
         if interrupts.count:
             raise KeyboardInterrupt
-        audience.live.tick()
+        audience.tick()
 
     # A slice may be long: a second Ctrl-C does not wait for its end.
     interrupts.raising = True

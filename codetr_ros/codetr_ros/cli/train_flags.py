@@ -51,6 +51,14 @@ FLAGS: Sequence[tuple[str, Any, Any]] = [
         False,
     ),
     (
+        'watch',
+        Annotated[
+            bool,
+            tyro.conf.arg(help='serve a page that shows the run, to browsers of this machine'),
+        ],
+        False,
+    ),
+    (
         'tensorboard',
         Annotated[
             bool, tyro.conf.arg(help='write events for TensorBoard into the folder tensorboard')

@@ -1,7 +1,7 @@
 """The course of a run: the numbers of its `metrics.csv` over training."""
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from codetr_ros.runs.folder import RunFolderError
@@ -22,18 +22,27 @@ def read(path: Path) -> dict[str, Points]:
     Raises:
         RunFolderError: it cannot be read, or is not a run's.
     """
-    columns: dict[str, list[tuple[float, float]]] = {}
     try:
         with path.open(newline='') as file:
-            for row in csv.DictReader(file):
-                step = float(row.pop('step'))
-                for name, value in row.items():
-                    if value:
-                        columns.setdefault(name, []).append((step, float(value)))
+            return parse(file)
     except (OSError, KeyError, ValueError, TypeError, AttributeError) as error:
         raise RunFolderError(
             f'{path} is not the table of a run ({error}): remove it, a report can do without it'
         ) from None
+
+
+def parse(lines: Iterable[str]) -> dict[str, Points]:
+    """The same of the lines of such a table.
+
+    Raises:
+        KeyError, ValueError, TypeError, AttributeError: they are no such table.
+    """
+    columns: dict[str, list[tuple[float, float]]] = {}
+    for row in csv.DictReader(lines):
+        step = float(row.pop('step'))
+        for name, value in row.items():
+            if value:
+                columns.setdefault(name, []).append((step, float(value)))
     return dict(columns)
 
 

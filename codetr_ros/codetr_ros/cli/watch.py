@@ -1,0 +1,71 @@
+"""`codetr watch`: a page in the browser that shows a run, live or later."""
+
+import dataclasses
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from codetr_ros.cli import refuse
+from codetr_ros.cli.terminal import console, parse_arguments
+
+POLL = 0.25
+"""Seconds between two looks at the folder."""
+NICENESS = 10
+"""Whoever watches a run must not slow it down."""
+HOST_HELP = (
+    'address to answer at: this machine only by default; 0.0.0.0 for all that reach it, who then '
+    'need the token of the printed address'
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Show a run in the browser, while it lasts or later: returns and scores, losses, the newest
+    episode with its inferred rewards, who takes part, and the settings that differ from a preset.
+    Nothing in the folder is changed, and nothing is loaded from the network. Ctrl-C ends it.
+    """
+
+    run_dir: Annotated[
+        str, tyro.conf.Positional, tyro.conf.arg(metavar='RUN', help="the run's folder")
+    ]
+    host: Annotated[str, tyro.conf.arg(metavar='ADDRESS', help=HOST_HELP)] = '127.0.0.1'
+    port: Annotated[
+        int, tyro.conf.arg(metavar='N', help='port to answer at; 0: one that is free')
+    ] = 0
+    allow_name: Annotated[
+        tuple[str, ...],
+        tyro.conf.arg(
+            metavar='NAME', help='further names of this machine by which browsers may ask'
+        ),
+    ] = ()
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Serve the page until Ctrl-C; returns the exit code."""
+    given = parse_arguments(Arguments, prog='codetr watch', arguments=arguments)
+    from codetr_ros.config import SettingsError
+    from codetr_ros.pages.address import PageError
+    from codetr_ros.pages.feed import Feed
+    from codetr_ros.pages.watching import RunSource, serve
+    from codetr_ros.processes.supervise import Interrupts
+    from codetr_ros.runs import folder as run_folder
+    from codetr_ros.runs.folder import RunFolderError
+
+    folder = Path(given.run_dir)
+    os.nice(NICENESS)
+    with Interrupts() as interrupts:
+        try:
+            feed = Feed()
+            source = RunSource(folder, run_folder.read_settings(folder), feed)
+            with serve(source, feed, given.host, given.port, given.allow_name) as server:
+                console().print(f'watch {folder} at {server.url} (Ctrl-C ends it)')
+                while not interrupts.count:
+                    source.poll()
+                    time.sleep(POLL)
+        except (RunFolderError, SettingsError, PageError) as error:
+            return refuse(str(error))
+    return 0
