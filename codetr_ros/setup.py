@@ -27,7 +27,7 @@ setup(
         ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),
         (f'share/{package_name}', ['package.xml']),
         (f'share/{package_name}/launch', glob('launch/*.py')),
-        (f'share/{package_name}/config', glob('config/*.yaml')),
+        (f'share/{package_name}/config', glob('config/*.yaml') + glob('config/*.json')),
     ],
     python_requires='>=3.10',  # colcon cannot read it in setup.cfg; install_requires is there
     zip_safe=False,  # presets are read as files

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from codetr_ros import cli, config
-from codetr_ros.cli.flags import COMMON
+from codetr_ros.config import USUAL
 from codetr_ros.offline.settings import OF_NO_EFFECT, FitSettings
 
 DOCS = Path(__file__).parents[2] / 'docs'
@@ -33,8 +33,8 @@ def explained(
 
 
 def test_twenty_settings_are_those_that_people_use() -> None:
-    assert len(COMMON) == len(set(COMMON)) == 20
-    assert set(COMMON) <= EVERY
+    assert len(USUAL) == len(set(USUAL)) == 20
+    assert set(USUAL) <= EVERY
 
 
 def test_the_help_of_train_explains_the_common_settings_and_names_the_flag_that_explains_all(
@@ -42,7 +42,7 @@ def test_the_help_of_train_explains_the_common_settings_and_names_the_flag_that_
 ) -> None:
     names, text = explained(capsys, monkeypatch, 'train', '--help')
 
-    assert names & EVERY == set(COMMON)
+    assert names & EVERY == set(USUAL)
     assert OWN['train'] <= names
     assert '--help-all explains all' in text
     assert explained(capsys, monkeypatch, 'train', '-h')[0] == names
@@ -65,7 +65,7 @@ def test_the_help_of_fit_explains_what_a_fit_uses(
     fitting = set(FitSettings.model_fields)
 
     common, text = explained(capsys, monkeypatch, 'fit', '--help')
-    assert common & EVERY - fitting == used & set(COMMON) - fitting
+    assert common & EVERY - fitting == used & set(USUAL) - fitting
     assert fitting | OWN['fit'] <= common
     assert '--help-all explains all' in text
 

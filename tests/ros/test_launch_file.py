@@ -13,6 +13,9 @@ from launch.actions import EmitEvent, ExecuteProcess, RegisterEventHandler
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
 from launch_ros.actions import Node
+from launch_ros.utilities import evaluate_parameters
+
+from codetr_ros.config import USUAL, SettingsError
 
 FILE = Path(__file__).resolve().parents[2] / 'codetr_ros' / 'launch' / 'train.launch.py'
 
@@ -26,18 +29,29 @@ def module():
     return made
 
 
+def parameters(node, context):
+    """Names and values of the parameters that a node is given."""
+    found = {}
+    for each in evaluate_parameters(context, node._Node__parameters):
+        found |= each
+    return found
+
+
 @pytest.fixture
 def started(module, tmp_path):
     """Package and executable of each node that the launch file starts under some settings."""
 
-    def start(*lines):
+    def start(*lines, **given):
         config = tmp_path / 'config.yaml'
-        config.write_text('\n'.join(lines) + '\n')
+        config.write_text('\n'.join(lines or ['seed: 0']) + '\n')
         context = LaunchContext()
-        for name, (default, _) in module.ARGUMENTS.items():
-            context.launch_configurations[name] = default
-        context.launch_configurations['config'] = str(config)
+        for argument in module.generate_launch_description().get_launch_arguments():
+            default = ''.join(part.text for part in argument.default_value)
+            context.launch_configurations[argument.name] = default
+        context.launch_configurations.update({'config': str(config)} | given)
         nodes = [made for made in module.nodes(context) if isinstance(made, Node)]
+        if given:
+            return {node._Node__node_name: parameters(node, context) for node in nodes}
         return [(node.node_package, node.node_executable) for node in nodes]
 
     return start
@@ -56,6 +70,43 @@ def test_all_nodes_of_a_run_are_started(started):
 def test_nodes_that_a_run_does_not_need_are_not_started(started):
     names = [executable for _, executable in started('method: hc', 'evaluate_every: 0')]
     assert sorted(names) == ['learner', 'record', 'sim']
+
+
+def test_each_usual_setting_is_an_argument_that_reaches_the_learner_with_its_type(started):
+    given = {'task': 'Hopper-v5', 'delay': '25', 'sac.hidden': '[64, 32]', 'overlap': 'true'}
+    nodes = started('method: hc', **given, method='rrd', simulators='2')
+    assert set(nodes) == {'sim', 'sim_2', 'record', 'learner', 'reward', 'evaluate'}
+    learner = nodes['learner']
+    shown = {name: learner[name] for name in (*given, 'method', 'simulators')}
+    assert shown == {
+        'task': 'Hopper-v5',
+        'delay': 25,
+        'sac.hidden': (64, 32),
+        'overlap': True,
+        'method': 'rrd',
+        'simulators': 2,
+    }
+    assert 'seed' not in learner
+    assert 'task' not in nodes['sim_2']
+
+
+def test_there_is_an_argument_for_each_usual_setting(module):
+    arguments = {
+        one.name: one for one in module.generate_launch_description().get_launch_arguments()
+    }
+    assert set(arguments) == {*module.ARGUMENTS, *USUAL}
+    for name in USUAL:
+        assert arguments[name].description.startswith('setting: ')
+
+
+def test_simulators_that_are_started_by_hand_are_left_out(started):
+    nodes = started(start_simulators='false', seed='1')
+    assert set(nodes) == {'record', 'learner', 'reward', 'evaluate'}
+
+
+def test_a_setting_that_is_refused_is_named(started):
+    with pytest.raises(SettingsError, match='train.launch.py.*delay.*-3'):
+        started(delay='-3')
 
 
 @pytest.mark.parametrize(

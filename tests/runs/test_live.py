@@ -93,10 +93,8 @@ def test_the_status_names_the_phase_and_what_each_part_waits_for(done: Done):
     phases = [status['phase'] for status in done.statuses]
     assert phases == sorted(phases)
     assert {0, 5} <= set(phases)
-    waiting = {
-        node['waiting'] for status in done.statuses for node in status['nodes'] if node['waiting']
-    }
-    assert any('permission for phase' in text for text in waiting)
+    doing = {node['doing'] for status in done.statuses for node in status['nodes']}
+    assert any('waits for permission for phase' in text for text in doing)
     last = json.loads((done.folder / 'status.json').read_text())
     assert (last['state'], last['phase'], last['lost']) == ('finished', 6, 0)
     assert {node['name'] for node in last['nodes']} == {
@@ -212,6 +210,8 @@ def test_the_nodes_of_a_run_over_topics_are_those_that_are_present(tmp_path: Pat
             topics=(),
             published=np.zeros(0, np.uint64),
             missed=2,
+            doing='waits for the commit of phase 3',
+            waiting=4.25,
         )
     )
     audience.tick()
@@ -219,6 +219,7 @@ def test_the_nodes_of_a_run_over_topics_are_those_that_are_present(tmp_path: Pat
     assert (status['namespace'], status['lost'], status['state']) == ('/run_r', 2, 'running')
     (node,) = status['nodes']
     assert (node['role'], node['name'], node['missed']) == ('reward', 'reward', 2)
+    assert (node['doing'], node['waiting']) == ('waits for the commit of phase 3', 4.2)
     assert not (tmp_path / 'newest_episode.json').exists(), 'the bag has it'
 
 

@@ -31,13 +31,6 @@ HELP_ALL_FIELD = (
     False,
 )
 """Lists `--help-all`, on which `explained` acts."""
-COMMON = (
-    *('task', 'composite', 'delay', 'method', 'steps', 'seed', 'warmup_steps', 'memory_steps'),
-    *('overlap', 'simulators', 'envs', 'evaluate_every', 'evaluate_episodes', 'r_max'),
-    *('threads', 'device', 'reward_device', 'codetr.label', 'codetr.gradient_steps'),
-    'sac.hidden',
-)
-"""The settings that people change most, by dotted name: `--help` explains these alone."""
 
 
 def _help(field: FieldInfo) -> str:
@@ -102,7 +95,7 @@ def explained(
         return [HELP[1]], fields, description
     if not any(argument in HELP for argument in arguments):
         return list(arguments), fields, description
-    common = [field for field in settings_fields(base, COMMON) if field[0] not in left_out]
+    common = [field for field in settings_fields(base, config.USUAL) if field[0] not in left_out]
     note = f'The settings below are those that people change most; {HELP_ALL} explains all.'
     return [HELP[1]], common, f'{description}\n\n{note}'
 

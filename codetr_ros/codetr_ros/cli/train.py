@@ -201,6 +201,7 @@ def train(
         with progress:
             way = _in_process if topics is None else partial(_over_topics, topics)
             outcome = way(settings, run_id, folder, audience, interrupts)
+        live.end('ending')
         bag = folder / run_folder.BAG
         built = summary.build(
             outcome.reports, bag if bag.is_dir() else None, outcome.interrupted, outcome.failure
@@ -213,7 +214,7 @@ def train(
             results.write(folder, summary, built, draw)
         except OSError as error:
             outcome.failure = '; '.join(filter(None, (outcome.failure, str(error))))
-    live.end(outcome.state, outcome.failure)
+        live.end(outcome.state, outcome.failure)
     results.show(built, folder, console(tables=True))
     if outcome.failure:
         show_failure(outcome)

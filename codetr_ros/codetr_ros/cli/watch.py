@@ -66,6 +66,7 @@ def main(arguments: Sequence[str]) -> int:
                 while not interrupts.count:
                     source.poll()
                     time.sleep(POLL)
+                source.poll()  # how the run ended
         except (RunFolderError, SettingsError, PageError) as error:
             return refuse(str(error))
     return 0

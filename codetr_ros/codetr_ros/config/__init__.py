@@ -37,11 +37,13 @@ from codetr_ros.config.methods import (
 )
 from codetr_ros.config.run import Settings
 from codetr_ros.config.threads import settled
+from codetr_ros.config.usual import USUAL, from_text
 
 __all__ = [
     'IN_PROCESS_ONLY',
     'PRESETS',
     'SCORE_LEARNERS',
+    'USUAL',
     'AggregateSettings',
     'CodetrSettings',
     'Composite',
@@ -66,6 +68,7 @@ __all__ = [
     'explain',
     'flatten',
     'from_canonical',
+    'from_text',
     'in_words',
     'load',
     'names',

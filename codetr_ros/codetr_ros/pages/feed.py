@@ -108,6 +108,7 @@ class Feed:
                     await asyncio.wait_for(event.wait(), BEAT)
                 except asyncio.TimeoutError:
                     yield ': still here\n\n'
+            yield self._newer(seen)[1]  # what was published just before the end
         finally:
             with self._lock:
                 del self._woken[event]

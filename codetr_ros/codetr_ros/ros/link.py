@@ -19,6 +19,7 @@ from rclpy.publisher import Publisher
 from codetr_ros.config import Settings
 from codetr_ros.records import TOPICS, Record
 from codetr_ros.ros import messages, qos
+from codetr_ros.ros.plots import Plots
 
 RECORDS_OF_TOPIC = {topic: record_type for record_type, topic in TOPICS.items()}
 
@@ -36,6 +37,7 @@ class Link:
         self._executor.add_node(self.node)
         self._publishers: dict[str, Publisher] = {}
         self._diagnostics = self.node.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._plots = Plots(self.node)
         self._events = 0
         self.inbox: deque[Callable[[], None]] = deque()
         self.published: Counter[str] = Counter()
@@ -93,6 +95,7 @@ class Link:
     def publish(self, record: Record) -> None:
         """Publish a record on its topic and count it."""
         self.send(TOPICS[type(record)], self.message(record))
+        self._plots.publish(record)
 
     def message(self, record: Record) -> Any:
         """The message of a record, stamped with the present time."""

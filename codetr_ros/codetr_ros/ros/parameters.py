@@ -210,6 +210,11 @@ def _outward(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
+def as_parameters(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings by dotted name as the values of parameters."""
+    return {name: _outward(value) for name, value in values.items()}
+
+
 def _inward(name: str, value: Any) -> Any:
     _, optional = _plain(FIELDS[name].annotation)
     if optional and value == NOT_GIVEN:

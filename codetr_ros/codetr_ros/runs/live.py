@@ -24,7 +24,7 @@ AT_LEAST = 1.0
 SHARE = 1 / 200
 """Of the run's time, the most that writing takes."""
 
-State = Literal['running', 'finished', 'interrupted', 'failed']
+State = Literal['running', 'ending', 'finished', 'interrupted', 'failed']
 
 
 class Part(Protocol):
@@ -85,6 +85,8 @@ class Live:
                 'role': record.role,
                 'name': record.node.rsplit('/', 1)[-1],
                 'finished': record.finished,
+                'doing': record.doing,
+                'waiting': round(record.waiting, 1),
                 'missed': int(record.missed),
                 'seen': _now(),
             }
@@ -107,7 +109,7 @@ class Live:
         """Write how the run ended.
 
         Args:
-            state: finished, interrupted or failed.
+            state: finished, interrupted, failed, or ending: the summary is being made.
             failure: why it failed.
         """
         if not self._broken:
@@ -163,8 +165,11 @@ class Live:
                 'finished': part.finished,
                 'missed': 0,
                 'seen': _now(),
-                'doing': 'has finished' if part.finished else 'takes turns with the others',
-                'waiting': '' if part.finished else part.waiting_for(),
+                # in turn: which of them has work to do is not known between two slices
+                'doing': 'has finished'
+                if part.finished
+                else f'works in turn; idle, it waits for {part.waiting_for()}',
+                'waiting': 0.0,
             }
             for name, (role, part) in self._parts.items()
         ]

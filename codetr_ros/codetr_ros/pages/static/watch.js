@@ -59,8 +59,10 @@ function duration(seconds) {
 }
 
 function showStatus(status) {
-  ended = status.state !== 'running' && status.state !== undefined;
-  let state = status.state ?? 'started by hand: who takes part is not known here';
+  ended = ['finished', 'interrupted', 'failed'].includes(status.state);
+  const words = { ending: 'ends: the report is being made' };
+  let state = words[status.state] ?? status.state
+    ?? 'started by hand: who takes part is not known here';
   if (status.silent) state += `, but silent for ${status.silent} s`;
   write(at('state'), state);
   at('state').className = status.state === 'failed' || status.silent ? 'bad' : '';
@@ -105,11 +107,11 @@ function showNodes(status) {
     node.name,
     node.role,
     node.doing || (node.finished ? 'has finished' : 'is there'),
-    node.waiting || '–',
+    node.waiting ? duration(node.waiting) : '–',
     node.missed,
     node.seen ? new Date(node.seen).toLocaleTimeString() : '–',
   ]);
-  const head = ['name', 'role', 'does', 'waits for', 'lost', 'heard of at'];
+  const head = ['name', 'role', 'does, or waits for', 'since', 'lost', 'heard of at'];
   at('nodes').replaceChildren(table(head, rows, `${rows.length} take part`, (i) => i === 4));
 }
 
