@@ -51,7 +51,8 @@ def tab(browser: Any) -> Iterator[Callable[..., Any]]:
             route.abort()
 
         def heard(message: Any) -> None:
-            if message.type == 'error':
+            # a server may end before the tab, which then asks for it again
+            if message.type == 'error' and 'ERR_CONNECTION_REFUSED' not in message.text:
                 page.errors.append(message.text)
 
         page.route(lambda address: urlsplit(address).scheme not in ('data', 'blob'), through)
