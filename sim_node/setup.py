@@ -22,6 +22,10 @@ setup(
     install_requires=['setuptools'],
     zip_safe=True,
     entry_points={
-        'console_scripts': ['sim = sim_node.sim:main', 'evaluate = sim_node.evaluate:main']
+        'console_scripts': [
+            'sim = sim_node.sim:main',
+            'evaluate = sim_node.evaluate:main',
+            'robot = sim_node.robot:main',
+        ]
     },
 )

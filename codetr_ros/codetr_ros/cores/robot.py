@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -36,6 +37,7 @@ from codetr_ros.records.roles import subscribed
 from codetr_ros.robots import mapping
 from codetr_ros.robots.control import Control
 from codetr_ros.robots.deadlines import Deadlines
+from codetr_ros.robots.errors import MessageError
 from codetr_ros.robots.guard import Guard, Hold
 from codetr_ros.robots.reset import Resetting
 from codetr_ros.robots.senses import Senses
@@ -44,6 +46,7 @@ from codetr_ros.runs.reports import CoreReport
 from codetr_ros.seeding import generator
 from codetr_ros.simulation.permission import acting_policy, check_policy
 
+BACK = 0.1  # [s] by which a clock must go back to have been set back
 PERMISSION, BEHIND, FINISHED = 'permission', 'learner behind', 'end of the run'
 
 
@@ -134,6 +137,8 @@ class Robot(Part):
         self._newest: tuple[Policy, ActingPolicy | None] | None = None
         self._last: Policy | None = None  # the one that permits nothing more
         self._out: list[Record] = []  # made between two slices
+        self._clock_at = clock()
+        self._counters: Counter[str] = Counter()
         self.versions: Counter[int] = Counter()  # steps begun under each policy
 
     # ---- records
@@ -201,7 +206,10 @@ class Robot(Part):
         while not self.senses.size:
             yield None
         yield [self._spec()]
+        if self.control.active:  # before anything was observed
+            self.deadlines.start(self.clock())
         while not self.finished:
+            self._check_clock()
             if not self.deadlines.reached(self.clock()):
                 yield self._given([])
                 continue
@@ -275,6 +283,27 @@ class Robot(Part):
 
     # ---- what people ask for
 
+    def use_clock(self, clock: Callable[[], float]) -> None:
+        """Take the time from another clock [s]."""
+        self.clock = clock
+        self._restart(clock())
+
+    def _restart(self, now: float) -> None:
+        self._clock_at = now
+        self.guard.restart(now)
+        if self.control.active:
+            self.deadlines.start(now)
+
+    def _check_clock(self) -> None:
+        """Hold nothing that lies in the future, where the clock was set back."""
+        now = self.clock()
+        if now < self._clock_at - BACK:
+            self.senses.forget()
+            self.control.halt()
+            self._restart(now)
+            self._counters['times that the clock went back'] += 1
+        self._clock_at = max(now, self._clock_at)
+
     def activate(self) -> None:
         """Drive the robot: the first control step is due now."""
         self.control.activate()
@@ -285,6 +314,27 @@ class Robot(Part):
         records = self._given(self.control.deactivate())
         self.deadlines.stop()
         return records or []
+
+    def stop(self, why: str) -> None:
+        """Stop the robot at once, until a person lets it go on."""
+        self.control.stop(why)
+
+    def stop_message(self, pressed: bool) -> None:
+        """Take a message of the stop topic; true stops the robot at once."""
+        new = pressed and not self.guard.stopped
+        self.guard.stop_message(pressed, self.clock())
+        if new:
+            self.control.halt()
+
+    def episode_message(self, message: Any) -> None:
+        """Take a message of the episode topic, which ends the episode where the mapping has it."""
+        try:
+            ends = self.rules.episode.ends(message)
+        except MessageError as error:
+            self.senses.unreadable(error)
+            return
+        if ends:
+            self.control.end_episode()
 
     def leave_active(self) -> None:
         """The same between two slices."""
@@ -317,7 +367,7 @@ class Robot(Part):
 
     def report(self) -> CoreReport:
         """Counts for the run's summary."""
-        counters = self.control.counts + self.senses.counts
+        counters = self.control.counts + self.senses.counts + self._counters
         counters['steps'] = self._log.total
         counters['policies used'] = len(self.versions)
         whole = {name: round(value) for name, value in self.deadlines.metrics().items()}

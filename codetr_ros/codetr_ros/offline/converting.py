@@ -30,7 +30,7 @@ from codetr_ros.robots.conversion import JOINTS_DOUBLED, Conversion
 from codetr_ros.robots.doubled_joints import DoubledJoints
 from codetr_ros.robots.episode_scores import EpisodeScores
 from codetr_ros.robots.mapping import Mapping
-from codetr_ros.robots.message_fields import NS, field
+from codetr_ros.robots.message_fields import NS
 from codetr_ros.robots.values import Values, names_a_joint_twice, numbers
 
 NO_OBSERVATION = 'samples without an observation within max_age'
@@ -150,10 +150,7 @@ class Converter:
         return array
 
     def _ends(self, message: Message) -> bool:
-        rule = self._rules.episode
-        if rule.field is None:
-            return True
-        return bool(field(message.message, rule.field, message.topic) == rule.equals)
+        return self._rules.episode.ends(message.message)
 
     # ------------------------------------------------------------------------------------------
     # steps

@@ -36,6 +36,10 @@ class Guard:
         self._pressed = False  # the stop topic has brought true, and no false since
         self._speed: str | None = None
         self.paused = False
+        self.restart(now)
+
+    def restart(self, now: float) -> None:
+        """Watch from now on, as if everything had just come: another clock, or one set back."""
         self._stop_at = self._heartbeat_at = self._learner_at = now
 
     # ---- what arrives

@@ -5,14 +5,14 @@
 
 from collections.abc import Mapping as AnyMapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from codetr_ros.config import Group, SettingsError, in_words, validate
 from codetr_ros.robots.live import Live
-from codetr_ros.robots.message_fields import Clock, FieldPath, Timed, Topic
+from codetr_ros.robots.message_fields import Clock, FieldPath, Timed, Topic, field
 from codetr_ros.robots.score_rules import Score
 from codetr_ros.robots.values import Values
 from codetr_ros.system.parsing import ParseError, read_yaml
@@ -57,6 +57,17 @@ class Episodes(Group):
         'ended',
         description='whether the message names the episode that it ends, or the one that begins',
     )
+
+    def ends(self, message: Any) -> bool:
+        """Whether a message on the topic ends the episode.
+
+        Raises:
+            MessageError: it lacks the field.
+        """
+        if self.field is None:
+            return True
+        assert self.topic is not None
+        return bool(field(message, self.field, self.topic) == self.equals)
 
     @model_validator(mode='after')
     def _field_and_value(self) -> 'Episodes':

@@ -42,6 +42,7 @@ class Senses:
         wanted = [*rules.observation, self._position, self._speed]
         self._wanted: list[Values] = [values for values in wanted if values is not None]
         self._held: dict[int, tuple[float, F64]] = {}
+        self._size = 0
         self.counts: Counter[str] = Counter()  # of messages that could not be used
         self.fault = ''  # why the newest of these could not be read
 
@@ -49,6 +50,10 @@ class Senses:
     def topics(self) -> set[str]:
         """Full names of the topics that must be received."""
         return {values.topic for values in self._wanted}
+
+    def forget(self) -> None:
+        """Hold no value: the clock was set back, and everything held is of later than now."""
+        self._held.clear()
 
     def take(self, topic: str, message: Any, now: float) -> None:
         """Take a message that was received now [s]."""
@@ -58,11 +63,15 @@ class Senses:
                 if values.topic == topic:
                     self._hold(i, values, message, at)
         except MessageError as error:
-            self.counts[UNREADABLE] += 1
-            self.fault = str(error)
+            self.unreadable(error)
             return
         if at > now + self._rules.sampling.max_age:
             self.counts[AHEAD] += 1
+
+    def unreadable(self, error: MessageError) -> None:
+        """Count a message that is not as the mapping has it."""
+        self.counts[UNREADABLE] += 1
+        self.fault = str(error)
 
     def _hold(self, place: int, values: Values, message: Any, at: float) -> None:
         array = numbers(message, values)
@@ -102,8 +111,11 @@ class Senses:
     @property
     def size(self) -> int:
         """O, once something was received from every topic; 0 before."""
-        if self.lacking():
-            return 0
+        if not self._size and not self.lacking():
+            self._size = self._sizes()
+        return self._size
+
+    def _sizes(self) -> int:
         return sum(len(self._held[i][1]) for i in range(len(self._rules.observation)))
 
     def positions(self) -> F64 | None:

@@ -166,8 +166,7 @@ def join(
         make_folder(folder)
         run_folder.write_settings(folder, settings)
     checkpoints = folder / run_folder.CHECKPOINTS if folder else None
-    own = {name: member.values[name] for name in parameters.core_parameters(member.role)}
-    core = make_core(run, settings, link.name, checkpoints, **own)
+    core = make_core(run, settings, link.name, checkpoints, **member.core_values)
     member.serve(core)
     return Joined(run, settings, core, folder)
 

@@ -52,6 +52,15 @@ class Link:
         """Name within the namespace of the run."""
         return str(self.node.get_name())
 
+    def host(self, node: Node) -> None:
+        """Let another node of this process have its turns with this one."""
+        self._executor.add_node(node)
+
+    def release(self, node: Node) -> None:
+        """Take such a node off the graph."""
+        self._executor.remove_node(node)
+        node.destroy_node()
+
     def store(self, handle: Callable[..., None], *arguments: Any) -> None:
         """For callbacks: let the main loop call `handle` at its next turn."""
         self._events += 1

@@ -61,10 +61,19 @@ class Membership:
         name: node name unless remapped.
         stop: true once the process is asked to stop.
         arguments: the command line from which the node has its parameters.
+        kind: the name under which its own parameters are listed; None: that of its role.
     """
 
-    def __init__(self, role: str, name: str, stop: Stop, arguments: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        role: str,
+        name: str,
+        stop: Stop,
+        arguments: Sequence[str] = (),
+        kind: str | None = None,
+    ) -> None:
         self.role = role
+        self._kind = kind or role
         self.stop = stop
         self._arguments = arguments
         self.link = Link(name)
@@ -91,6 +100,11 @@ class Membership:
         return Path(self.values['folder']) if self.values.get('folder') else None
 
     @property
+    def core_values(self) -> dict[str, Any]:
+        """The node's own parameters with which its core is made."""
+        return {name: self.values[name] for name in parameters.core_parameters(self._kind)}
+
+    @property
     def deadline(self) -> float:
         """Seconds to wait for peers; 0: for ever."""
         return float(self.values['peer_deadline'])
@@ -111,8 +125,8 @@ class Membership:
             ParameterError: one of them is unknown, of the wrong type or out of range.
             NodeError: nothing can be written where one of them points to.
         """
-        given.check_names(self.link.node, self.role, self._arguments)
-        self.values = parameters.declare_own(self.link.node, self.role)
+        given.check_names(self.link.node, self._kind, self._arguments)
+        self.values = parameters.declare_own(self.link.node, self._kind)
         self.link.advertise(['presence'])
         self.link.subscribe(Presence, self.take)
         self.link.subscribe(RunSpec, self.take)

@@ -124,7 +124,7 @@ class Node:
             else:
                 member.doing, member.waits_since = wiring.waits(), waiting
                 patience.check(now, now - waiting, member.doing, member.traffic.lost())
-            member.turn(IDLE)
+            member.turn(wiring.pause())
 
     def _slice(self, work: Iterator[Any], worked: bool) -> Any:
         """One slice of a core. Before the core has yielded anything, a signal cuts it short: it
@@ -259,6 +259,7 @@ def run_node(
     argv: Iterable[str] | None = None,
     stop: Stop | None = None,
     wire: Wire = Wiring,
+    kind: str | None = None,
 ) -> int:
     """The main function of a node.
 
@@ -268,7 +269,8 @@ def run_node(
         load_core: does the slow imports and returns what makes the core.
         argv: command line without the program; None: that of the process.
         stop: handlers of signals that are installed already; None: install them here.
-        wire: another wiring (the recorder's).
+        wire: another wiring (the recorder's, a robot's).
+        kind: the name under which its own parameters are listed; None: that of its role.
 
     Returns:
         Exit code: 0, also after SIGINT or SIGTERM unless other nodes had failed before; 1 after an
@@ -287,7 +289,7 @@ def run_node(
         print(f'{name}: {error}', file=sys.stderr)
         return 2
     try:
-        member = Membership(role, name, stop, arguments)
+        member = Membership(role, name, stop, arguments, kind)
         logging.getLogger('codetr_ros').addHandler(_ToRos(member.log))
         code = Node(member, lambda it: joining.join(it, load_core, announce), wire).run()
         return code

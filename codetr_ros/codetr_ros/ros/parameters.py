@@ -92,6 +92,16 @@ OWN_OF_ROLE: dict[str, dict[str, Own]] = {
             of_core=True,
         ),
     },
+    'robot': {
+        'mapping': Own(
+            '', 'the mapping file: the topics of the robot, its limits and its rate', of_core=True
+        ),
+        'autostart': Own(
+            False,
+            'true: drive the robot as soon as everybody is there; false: wait until somebody '
+            'activates it (lifecycle of <node>_driver)',
+        ),
+    },
     'record': {
         'bag': Own(
             '',

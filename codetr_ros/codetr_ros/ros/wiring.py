@@ -5,7 +5,7 @@ from typing import Any
 
 from codetr_ros.records.roles import published_by
 from codetr_ros.ros.course import Course
-from codetr_ros.ros.gathering import absent_or_unmatched
+from codetr_ros.ros.gathering import IDLE, absent_or_unmatched
 from codetr_ros.ros.joining import Joined
 from codetr_ros.ros.membership import Membership
 from codetr_ros.runs.reports import BagReport
@@ -65,6 +65,10 @@ class Wiring:
         for each in given:
             self._course.note(each)
         self._course.tick(doing)
+
+    def pause(self) -> float:
+        """Seconds to wait for a message when there is nothing to do."""
+        return IDLE
 
     def waits(self) -> str:
         """What the node waits for, in words."""
