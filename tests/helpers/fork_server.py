@@ -43,6 +43,7 @@ IMPORTED = (
     'learner_node.learner',
     'reward_node.reward',
     'sim_node.evaluate',
+    'sim_node.robot',
     'sim_node.sim',
 )
 """What takes long and is of no ROS."""

@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PYTHON_PACKAGES = bootstrap.PACKAGES[1:]
 EXECUTABLES = {
     'codetr_ros': {'codetr', 'record'},
-    'sim_node': {'sim', 'evaluate'},
+    'sim_node': {'sim', 'evaluate', 'robot'},
     'reward_node': {'reward'},
     'learner_node': {'learner'},
 }
