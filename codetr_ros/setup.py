@@ -32,6 +32,10 @@ setup(
     python_requires='>=3.10',  # colcon cannot read it in setup.cfg; install_requires is there
     zip_safe=False,  # presets are read as files
     entry_points={
-        'console_scripts': ['codetr = codetr_ros.cli:main', 'record = codetr_ros.ros.record:main'],
+        'console_scripts': [
+            'codetr = codetr_ros.cli:main',
+            'record = codetr_ros.ros.record:main',
+            'score = codetr_ros.ros.score:main',
+        ],
     },
 )

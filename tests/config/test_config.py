@@ -29,7 +29,11 @@ def test_the_paper_preset_is_the_default_of_every_setting() -> None:
 def test_the_paper_preset_spells_out_every_setting_of_every_method() -> None:
     text = resources.files('codetr_ros.config.presets').joinpath('paper.yaml').read_text()
     said = dict(config.flatten(yaml.safe_load(text)))
-    assert [name for name in Settings().flat() if '.' in name and name not in said] == []  # type: ignore[call-arg]
+    assert [
+        name
+        for name in Settings().flat()
+        if '.' in name and name not in said and not name.startswith('people.')
+    ] == []  # type: ignore[call-arg]
 
 
 def test_the_papers_table_is_what_the_paper_preset_says() -> None:

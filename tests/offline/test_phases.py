@@ -34,6 +34,31 @@ def test_folding_the_bag_ends_with_the_weights_and_labels_of_the_run(a_run, tmp_
     assert said['changed_settings'] == {}
 
 
+def test_what_people_stated_late_and_corrected_is_learnt_from_the_bag_as_in_the_run(tmp_path):
+    settings = tiny(
+        task='InvertedPendulum-v5',
+        delay=10,
+        steps=800,
+        evaluate_every=0,
+        method='evidence',
+        scorer='simulated',
+        people__count=2,
+        people__late=130,
+        people__preferences=0.3,
+    )
+    records: list[Record] = []
+    reports = in_process.run(settings, 'calls', observe=records.append)
+    bag = write(tmp_path / 'bag', records)
+
+    said = fit(bag, tmp_path / 'out')
+
+    assert said[DIGEST] == reports['reward'].reward_model_sha256
+    rows = [r.lengths for r in records if isinstance(r, StepRewards)]
+    assert said['recorded_labels'] == {'same': sum(map(len, rows)), 'other': 0}
+    found = verify(bag)
+    assert found.sound, found.findings.named
+
+
 @pytest.mark.slow
 def test_labels_of_what_the_learner_drew_are_made_again_from_the_bag(tmp_path):
     settings = tiny(

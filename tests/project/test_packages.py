@@ -19,7 +19,7 @@ from codetr_ros.records.roles import TABLE
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON_PACKAGES = bootstrap.PACKAGES[1:]
 EXECUTABLES = {
-    'codetr_ros': {'codetr', 'record'},
+    'codetr_ros': {'codetr', 'record', 'score'},
     'sim_node': {'sim', 'evaluate', 'robot'},
     'reward_node': {'reward'},
     'learner_node': {'learner'},

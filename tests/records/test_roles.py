@@ -19,15 +19,17 @@ from codetr_ros.records.roles import (
 from helpers.builders import tiny
 
 FLOW = """
-run                learner                                sim evaluate reward record
-task               sim                                    learner reward record
+run                learner                                sim evaluate reward score record
+task               sim                                    learner reward score record
 policy             learner                                sim evaluate record
-transitions        sim                                    record reward learner
-composite_rewards  sim                                    record reward
-commits            record                                 reward learner
+transitions        sim                                    record reward learner score
+composite_rewards  sim score                              record reward
+preferences        score                                  record reward
+commits            record                                 reward learner score
 step_rewards       reward                                 learner record
+score_requests     reward                                 score record
 episodes           sim evaluate                           record
-true_rewards       sim                                    record
+true_rewards       sim                                    score record
 metrics            sim evaluate reward learner record     record
 """
 """Topic, who publishes on it and who must read it, where a reward node labels steps."""
@@ -48,7 +50,7 @@ def test_each_topic_has_its_publishers_and_its_readers(line):
 
 def test_where_nobody_labels_steps_the_learner_reads_the_scores_instead_of_labels():
     changed = {topic for topic in WRITERS if readers()[topic] != readers(labelled=False)[topic]}
-    assert changed == {'composite_rewards', 'step_rewards'}
+    assert changed == {'composite_rewards', 'preferences', 'step_rewards'}
     assert 'learner' in readers(labelled=False)['composite_rewards']
     assert 'learner' not in readers(labelled=False)['step_rewards']
 
@@ -83,8 +85,17 @@ def test_a_node_relies_only_on_roles_that_publish_what_it_reads():
         ({'simulators': 3}, {'sim': 3, 'evaluate': 1, 'reward': 1, 'record': 1, 'learner': 1}),
         ({'evaluate_every': 0}, {'sim': 1, 'reward': 1, 'record': 1, 'learner': 1}),
         ({'method': 'hc'}, {'sim': 1, 'evaluate': 1, 'record': 1, 'learner': 1}),
+        (
+            {'scorer': 'simulated'},
+            {'sim': 1, 'evaluate': 1, 'reward': 1, 'score': 1, 'record': 1, 'learner': 1},
+        ),
+        # the loop goes on without a person
+        (
+            {'scorer': 'person'},
+            {'sim': 1, 'evaluate': 1, 'reward': 1, 'record': 1, 'learner': 1},
+        ),
     ],
-    ids=['all', 'several simulators', 'no evaluation', 'no labels'],
+    ids=['all', 'several simulators', 'no evaluation', 'no labels', 'simulated people', 'person'],
 )
 def test_a_run_needs_the_roles_that_its_settings_ask_for_and_starts_the_learner_last(
     changes, expected

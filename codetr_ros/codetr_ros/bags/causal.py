@@ -4,10 +4,19 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import Protocol, TypeVar
 
-from codetr_ros.records import Commit, CompositeReward, Record, StepRewards, Transitions
+from codetr_ros.records import (
+    Commit,
+    CompositeReward,
+    Preference,
+    Record,
+    ScoreRequest,
+    StepRewards,
+    Transitions,
+)
+from codetr_ros.records.numbering import Judgement
 
 _MOST_HELD = 10_000  # the depth of another recorder's queue: a message that is later is lost
-_PERMITTING = (Transitions, CompositeReward, Commit)  # records that others wait for
+_PERMITTING = (Transitions, CompositeReward, Preference, Commit)  # records that others wait for
 
 
 class _Message(Protocol):
@@ -40,7 +49,7 @@ def causal(messages: Iterable[MessageT], lag: int) -> Iterator[MessageT]:
     def early(record: Record) -> bool:
         if isinstance(record, Transitions):
             return record.phase - lag > committed
-        if isinstance(record, StepRewards):
+        if isinstance(record, (StepRewards, ScoreRequest)):
             return record.phase > committed
         return isinstance(record, Commit) and any(
             number >= numbers[key] for key, number in named(record).items()
@@ -60,7 +69,7 @@ def causal(messages: Iterable[MessageT], lag: int) -> Iterator[MessageT]:
             record = following.record
             if isinstance(record, Commit):
                 committed = max(committed, record.phase)
-            elif isinstance(record, (Transitions, CompositeReward)):
+            elif isinstance(record, (Transitions, CompositeReward, Preference)):
                 key = publisher(record)
                 numbers[key] = max(numbers[key], record.sequence + 1)
             yield following
@@ -71,9 +80,14 @@ def causal(messages: Iterable[MessageT], lag: int) -> Iterator[MessageT]:
     yield from held
 
 
-def publisher(record: Transitions | CompositeReward) -> tuple[type, str]:
-    """The publisher that numbers such a record: the record's type and the publisher's name."""
-    return type(record), record.source if isinstance(record, Transitions) else record.scorer
+def publisher(record: Transitions | Judgement) -> tuple[type, str]:
+    """The publisher that numbers such a record: the record's type and the publisher's name.
+
+    Preferences have their numbers among those of their scorer's scores.
+    """
+    if isinstance(record, Transitions):
+        return Transitions, record.source
+    return CompositeReward, record.scorer
 
 
 def named(commit: Commit) -> dict[tuple[type, str], int]:

@@ -6,13 +6,12 @@ Memory: twelve bytes for each episode, and whatever still waits for its counterp
 from array import array
 from collections import OrderedDict
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from codetr_ros.bags.findings import Findings
-from codetr_ros.config import Lengths, delay_in_words
+from codetr_ros.config.cuts import Cuts
 from codetr_ros.records import (
     CompositeReward,
     RecordError,
@@ -22,52 +21,14 @@ from codetr_ros.records import (
     describe,
 )
 from codetr_ros.records.checks import check_transitions
+from codetr_ros.records.numbering import Numbering
 
 _MOST_SKIPPED = 1_000_000  # episodes
-_MOST_STEPS = 10_000_000  # of an episode
 _MOST_EARLY = 10_000  # scores
 _MOST_AHEAD = 10_000  # chunks kept for their true rewards while none have come yet
 _U32 = 2**32 - 1
 Span = tuple[int, int, int]
 """Episode, first step, length."""
-
-
-@dataclass(frozen=True)
-class Cuts:
-    """Where a run's settings cut episodes into segments."""
-
-    delay: int | str
-    seed: int
-
-    def segments(
-        self, source: str, episode: int, before: int, after: int, ended: bool
-    ) -> Iterator[tuple[int, int]]:
-        """First step and length of each segment of an episode that ends with some of its steps.
-
-        Args:
-            source: whose episode it is.
-            episode: its number.
-            before: steps of it before those.
-            after: steps of it with those.
-            ended: whether it has ended with them, so that the last segment may be shorter.
-        """
-        lengths = Lengths.of(self.delay)
-        first = begin = 0
-        if lengths.drawn:
-            if after > _MOST_STEPS:
-                return  # as for wild episode numbers
-        elif lengths.most:  # what is missing, however long, is passed over
-            first = begin = before // lengths.most * lengths.most
-        ends = lengths.ends(self.seed, source, episode, after - begin)
-        for end in (ends + begin).tolist():
-            if end > before:
-                yield first, end - first
-            first = end
-        if ended and first < after:
-            yield first, after - first
-
-    def __str__(self) -> str:
-        return delay_in_words(self.delay)
 
 
 class Numbers:
@@ -94,6 +55,33 @@ class Numbers:
         self.next = sequence + 1
         return True
 
+    def finish(self, place: Any) -> None:
+        """Report what never came."""
+
+
+class SharedNumbers(Numbers):
+    """The numbers of a scorer whose scores and preferences come on two topics: a number may come
+    before one below it.
+    """
+
+    def __init__(self, whose: str, findings: Findings) -> None:
+        super().__init__(whose, findings)
+        self._numbering = Numbering()
+
+    def take(self, sequence: int, place: Any) -> bool:
+        """Note a number and return whether it is new."""
+        if not self._numbering.take(sequence):
+            self._findings.add('duplicate', place, f'{self.whose}: number {sequence} comes again')
+            return False
+        self.next = self.whole = self._numbering.next
+        return True
+
+    def finish(self, place: Any) -> None:
+        """Report what never came."""
+        if early := sorted(self._numbering.early):
+            missing = missing_numbers(self.next, early[0] - 1)
+            self._findings.add('gap', place, f'{self.whose}: {missing} missing before {early[0]}')
+
 
 def missing_numbers(first: int, last: int) -> str:
     """`number 3 is` or `numbers 3 to 5 are`, before the word 'missing'."""
@@ -107,11 +95,15 @@ class SourceChecks:
         name: its name.
         cuts: where the run's settings cut episodes; None where the bag has no settings.
         findings: where faults are added.
+        elsewhere: others than the simulator score: a segment may have no score, or several.
     """
 
-    def __init__(self, name: str, cuts: Cuts | None, findings: Findings) -> None:
+    def __init__(
+        self, name: str, cuts: Cuts | None, findings: Findings, elsewhere: bool = False
+    ) -> None:
         self.name = name
         self.cuts = cuts
+        self.elsewhere = elsewhere
         self.spec: TaskSpec | None = None
         self.numbers = Numbers(f'transitions of {name!r}', findings)
         self.committed = -1  # last sequence number that a commit has named
@@ -215,6 +207,8 @@ class SourceChecks:
             return
         before = max(before, chunk.first_step)  # not what is missing
         for first, length in self.cuts.segments(self.name, episode, before, after, ended):
+            if self.elsewhere:
+                break  # nobody owes a score
             self._due[episode, first, length] = chunk.sequence, place
 
     def score(self, reward: CompositeReward, place: Any) -> None:
@@ -229,7 +223,9 @@ class SourceChecks:
         self.scored += reward.length
         if self.cuts is not None:
             span = episode, reward.first_step, reward.length
-            if self._due.pop(span, None) is None and span not in self._may_be_scored:
+            if self.elsewhere:
+                self._judged(span, reward, place)
+            elif self._due.pop(span, None) is None and span not in self._may_be_scored:
                 self._findings.add(
                     'segment',
                     place,
@@ -242,6 +238,18 @@ class SourceChecks:
                 'segment', place, f'{describe(reward)} scores steps that have their score already'
             )
         self._until[episode] = max(self._until[episode], after)
+
+    def _judged(self, span: Span, reward: CompositeReward, place: Any) -> None:
+        """Check that what somebody judges is a segment."""
+        assert self.cuts is not None
+        episode, first, length = span
+        after = self._lengths[episode]
+        ended = bool(self._ended[episode])
+        cut = self.cuts.segments(self.name, episode, first, after, ended)
+        if next(cut, None) != (first, length):
+            self._findings.add(
+                'segment', place, f'{describe(reward)} scores what is no segment of {self.cuts}'
+            )
 
     def _homeless(self, reward: CompositeReward, place: Any) -> None:
         self._findings.add(

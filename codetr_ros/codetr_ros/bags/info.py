@@ -13,6 +13,7 @@ from codetr_ros.records import (
     CompositeReward,
     EpisodeResult,
     Policy,
+    Preference,
     RunSpec,
     StepRewards,
     TaskSpec,
@@ -21,8 +22,8 @@ from codetr_ros.records import (
 from codetr_ros.system.parsing import ParseError, parse_json
 
 SETTINGS = (
-    *('task', 'composite', 'delay', 'score_missing', 'score_noise', 'score_levels', 'method'),
-    *('steps', 'seed', 'simulators', 'envs'),
+    *('task', 'composite', 'delay', 'score_missing', 'score_noise', 'score_levels', 'scorer'),
+    *('method', 'steps', 'seed', 'simulators', 'envs'),
 )
 """The settings that are shown."""
 _SMALL = 2.0**-64  # a sum of numbers so much smaller cannot overflow, and is as exact
@@ -84,6 +85,8 @@ class RunCounts:
     scores: Range = field(default_factory=Range)
     scored_steps: int = 0
     unscored: int = 0  # segments without a score
+    preferences: int = 0
+    scorers: dict[str, int] = field(default_factory=dict)  # judgements of each
     policy_versions: Range = field(default_factory=Range)
     model_versions: Range = field(default_factory=Range)
     labels: int = 0
@@ -101,11 +104,15 @@ class RunCounts:
         elif isinstance(record, Transitions):
             self._steps(record)
         elif isinstance(record, CompositeReward):
-            if math.isnan(record.value) and self.settings.get('score_missing'):
+            self.scorers[record.scorer] = self.scorers.get(record.scorer, 0) + 1
+            if math.isnan(record.value) and self._may_lack_scores:
                 self.unscored += 1
             else:
                 self.scores.add(record.value)
                 self.scored_steps += record.length
+        elif isinstance(record, Preference):
+            self.scorers[record.scorer] = self.scorers.get(record.scorer, 0) + 1
+            self.preferences += 1
         elif isinstance(record, Commit):
             self.phases.add(record.phase)
         elif isinstance(record, Policy):
@@ -115,6 +122,11 @@ class RunCounts:
             self.labels += len(record.labels)
         elif isinstance(record, EpisodeResult) and record.purpose == 'evaluation':
             self.evaluations.setdefault(record.step, Range()).add(record.true_return)
+
+    @property
+    def _may_lack_scores(self) -> bool:
+        elsewhere = self.settings.get('scorer', 'simulator') != 'simulator'
+        return elsewhere or bool(self.settings.get('score_missing'))
 
     def _settings(self, record: RunSpec) -> None:
         try:
@@ -148,6 +160,8 @@ class RunCounts:
             'steps_scored': self.scored_steps,
             'segments_unscored': self.unscored,
             'scores': self.scores.report(),
+            'preferences': self.preferences,
+            'scorers': dict(sorted(self.scorers.items())),
             'policy_versions': self.policy_versions.report(),
             'model_versions': self.model_versions.report(),
             'labels': self.labels,

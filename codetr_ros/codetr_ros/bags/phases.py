@@ -10,11 +10,19 @@ from codetr_ros.bags.files import bag_files
 from codetr_ros.bags.mcap_channels import McapChannels
 from codetr_ros.bags.mcap_file import McapFile
 from codetr_ros.bags.raw import RawMessage
-from codetr_ros.records import Commit, CompositeReward, Policy, Record, Transitions
+from codetr_ros.records import (
+    Commit,
+    CompositeReward,
+    Policy,
+    Preference,
+    Record,
+    Transitions,
+)
 from codetr_ros.records.fields import RECORD_TYPES, type_name
 from codetr_ros.records.identity import identity
+from codetr_ros.records.numbering import Judgement
 
-NAMED = (Policy, Transitions, CompositeReward, Commit)
+NAMED = (Policy, Transitions, CompositeReward, Preference, Commit)
 """The kinds of records that belong to a phase by their number or by its commit."""
 
 
@@ -33,7 +41,7 @@ class _Phase:
             return record.phase == self.commit.phase
         if isinstance(record, Transitions):
             of, name = ('sources', 'transitions'), record.source
-        elif isinstance(record, CompositeReward):
+        elif isinstance(record, Judgement):
             of, name = ('scorers', 'scores'), record.scorer
         else:
             return False
@@ -53,7 +61,10 @@ class Phases:
 
     def __init__(self) -> None:
         self._phases: dict[int, _Phase] = {}
-        self._begins: dict[int, Place] = {}  # of phases that are not committed
+        self._begins: dict[int, tuple[int, Place]] = {}  # of phases that are not committed
+        # judgements that no commit has named: they may have come long before it
+        self._judged: dict[tuple[str, int], tuple[int, Place]] = {}
+        self._noted = 0  # records: puts places in the order of the bag
         self._described: dict[Path, McapChannels] = {}
         self.newest: int | None = None
 
@@ -64,16 +75,28 @@ class Phases:
             record: the record.
             place: where the chunk begins in which it lies.
         """
+        self._noted += 1
         if isinstance(record, (Policy, Transitions)):
-            self._begins.setdefault(record.phase, place)
+            self._begins.setdefault(record.phase, (self._noted, place))
+        elif isinstance(record, Judgement):
+            self._judged.setdefault((record.scorer, record.sequence), (self._noted, place))
         elif isinstance(record, Commit) and record.phase not in self._phases:
             phase = record.phase
             before = self._phases.get(phase - 1)
-            begin = self._begins.pop(phase, place)
+            begins = [self._begins.pop(phase, (self._noted, place)), *self._named(record)]
             self._phases[phase] = _Phase(
-                record, None if before is None else before.commit, begin, place
+                record,
+                None if before is None else before.commit,
+                min(begins, key=lambda begin: begin[0])[1],
+                place,
             )
             self.newest = phase
+
+    def _named(self, commit: Commit) -> Iterator[tuple[int, Place]]:
+        """Where the judgements lie that a commit is the first to name."""
+        last = dict(zip(commit.scorers, commit.scores.tolist(), strict=True))
+        for key in [key for key in self._judged if key[1] <= last.get(key[0], -1)]:
+            yield self._judged.pop(key)
 
     def read(
         self, phase: int, kinds: Collection[str] = ()

@@ -7,7 +7,7 @@ in the run, in the same order. No ROS needed.
 """
 
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -22,17 +22,18 @@ from codetr_ros.config import Settings, SettingsError, from_canonical
 from codetr_ros.records import (
     TOPICS,
     Commit,
-    CompositeReward,
     Metrics,
     Policy,
     Presence,
     Record,
     RunSpec,
+    ScoreRequest,
     StepRewards,
     TaskSpec,
     Transitions,
     TrueRewards,
 )
+from codetr_ros.records.numbering import Judgement, Numbering
 from codetr_ros.runs.reports import CoreReport
 
 BATCH = 64
@@ -201,6 +202,7 @@ class Playback:
         self._pace = pace
         self._handled = dict.fromkeys(learners, -1)
         self._due: Counter[tuple[type, str]] = Counter()  # next sequence number of each publisher
+        self._numbers: defaultdict[str, Numbering] = defaultdict(Numbering)  # of each scorer
         self._waiting = ''
         self.phase = -1  # the last whose commit was yielded
         self.counters: Counter[str] = Counter()
@@ -265,7 +267,9 @@ class Playback:
         if self._handled and self._surplus(record):
             self.counters[f'{topic} of no phase that is played'] += 1
             return False
-        if not isinstance(record, (Transitions, CompositeReward)):
+        if isinstance(record, Judgement):
+            return self._new(record)
+        if not isinstance(record, Transitions):
             return True
         key = publisher(record)
         if record.sequence < self._due[key]:
@@ -274,17 +278,29 @@ class Playback:
         if record.sequence > self._due[key]:
             self._lacks(key, record.sequence - 1)
         self._due[key] += 1
-        if isinstance(record, Transitions):
-            self.counters['steps'] += record.steps
+        self.counters['steps'] += record.steps
+        return True
+
+    def _new(self, judgement: Judgement) -> bool:
+        """Whether a judgement is played for the first time; scores and preferences come on two
+        topics, so that a number may come before one below it.
+        """
+        key = publisher(judgement)
+        if not self._numbers[key[1]].take(judgement.sequence):
+            self.counters[f'{TOPICS[type(judgement)]} recorded twice'] += 1
+            return False
+        self._due[key] = self._numbers[key[1]].next
         return True
 
     def _surplus(self, record: Record) -> bool:
         if isinstance(record, Policy) and not record.steps.any():
             return False  # it announces that all phases have been permitted
-        if isinstance(record, (Policy, Transitions, TrueRewards, Commit, StepRewards)):
+        if isinstance(
+            record, (Policy, Transitions, TrueRewards, Commit, StepRewards, ScoreRequest)
+        ):
             return record.phase >= self._phases
         # a score does not name its phase: the commit does
-        return isinstance(record, CompositeReward) and self.phase == self._phases - 1
+        return isinstance(record, Judgement) and self.phase == self._phases - 1
 
     def _check(self, commit: Commit) -> None:
         """Refuse a commit that names something not played."""

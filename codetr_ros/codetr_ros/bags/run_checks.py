@@ -2,22 +2,27 @@
 
 import hashlib
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 
-from codetr_ros.bags.episodes import Cuts, Numbers, SourceChecks
+from codetr_ros.bags.episodes import Numbers, SharedNumbers, SourceChecks
 from codetr_ros.bags.findings import Findings
 from codetr_ros.bags.reader import Entry
 from codetr_ros.config import Lengths
+from codetr_ros.config.cuts import Cuts
+from codetr_ros.config.delays import LONGEST
 from codetr_ros.records import (
     PROTOCOL_VERSION,
     Commit,
     CompositeReward,
     EpisodeResult,
     Policy,
+    Preference,
+    RecordError,
     RunSpec,
     StepRewards,
     TaskSpec,
@@ -25,6 +30,8 @@ from codetr_ros.records import (
     TrueRewards,
     describe,
 )
+from codetr_ros.records.checks import check_preference
+from codetr_ros.records.numbering import Judgement
 from codetr_ros.system.parsing import parse_json
 
 
@@ -53,6 +60,7 @@ class RunChecks:
         self._run: RunSpec | None = None
         self._cuts: Cuts | None = None
         self._missing = False  # whether segments may have no score
+        self._elsewhere = False  # others than the simulator score, when and what they like
         self._permitted = 0
         self._parts: tuple[int, int, int] | None = None  # phase, next part, parts
         self._take: dict[type, Callable[[Any, Any], None]] = {
@@ -61,6 +69,7 @@ class RunChecks:
             Transitions: lambda record, place: self._source(record).transitions(record, place),
             TrueRewards: lambda record, place: self._source(record).true_rewards(record, place),
             CompositeReward: self._score,
+            Preference: self._preference,
             Commit: lambda record, place: self._waiting.append((record, place)),
             StepRewards: self._labels,
             Policy: self._policy,
@@ -90,7 +99,9 @@ class RunChecks:
 
     def _source(self, record: Any) -> SourceChecks:
         if record.source not in self.sources:
-            self.sources[record.source] = SourceChecks(record.source, self._cuts, self._findings)
+            self.sources[record.source] = SourceChecks(
+                record.source, self._cuts, self._findings, self._elsewhere
+            )
         return self.sources[record.source]
 
     def _add(self, kind: str, place: Any, text: str) -> None:
@@ -114,11 +125,13 @@ class RunChecks:
             settings = parse_json(record.settings)
             Lengths.of(settings['delay'])  # refuses what is no delay
             self._cuts = Cuts(settings['delay'], record.seed)
-            self._missing = settings.get('score_missing', 0) > 0
+            self._elsewhere = settings.get('scorer', 'simulator') != 'simulator'
+            self._missing = self._elsewhere or settings.get('score_missing', 0) > 0
         except (ValueError, LookupError, TypeError) as error:
             self._add('run', place, f'settings cannot be read: {error}')
         for source in self.sources.values():
             source.cuts = self._cuts
+            source.elsewhere = self._elsewhere
 
     def _task(self, record: TaskSpec, place: Any) -> None:
         source = self._source(record)
@@ -127,11 +140,7 @@ class RunChecks:
         source.spec = record
 
     def _score(self, record: CompositeReward, place: Any) -> None:
-        numbers = self._scorers.get(record.scorer)
-        if numbers is None:
-            numbers = Numbers(f'composite rewards of {record.scorer!r}', self._findings)
-            self._scorers[record.scorer] = numbers
-        if not numbers.take(record.sequence, place):
+        if not self._numbered(record).take(record.sequence, place):
             return
         if not np.isfinite(record.value) and not (self._missing and np.isnan(record.value)):
             self._add('value', place, f'{describe(record)} is not finite')
@@ -139,6 +148,44 @@ class RunChecks:
             self._add('value', place, f'{describe(record)} has no steps')
             return
         self._source(record).score(record, place)
+
+    def _numbered(self, record: Judgement) -> Numbers:
+        """The numbers of a scorer, whose scores and preferences have one sequence."""
+        if record.scorer not in self._scorers:
+            kind = SharedNumbers if self._elsewhere else Numbers
+            self._scorers[record.scorer] = kind(
+                f'composite rewards of {record.scorer!r}', self._findings
+            )
+        return self._scorers[record.scorer]
+
+    def _preference(self, record: Preference, place: Any) -> None:
+        if not self._numbered(record).take(record.sequence, place):
+            return
+        try:
+            check_preference(record, LONGEST)
+        except RecordError as error:
+            self._add('value', place, str(error))
+            return
+        # both are looked for like segments that are scored
+        first = CompositeReward(
+            run_id=record.run_id,
+            source=record.source,
+            scorer=record.scorer,
+            sequence=record.sequence,
+            episode=record.episode,
+            first_step=record.first_step,
+            length=record.length,
+            value=record.outcome,
+        )
+        second = replace(
+            first,
+            source=record.other_source,
+            episode=record.other_episode,
+            first_step=record.other_first_step,
+            length=record.other_length,
+        )
+        for each in (first, second):
+            self._source(each).score(each, place)
 
     def _commit(self, record: Commit, place: Any) -> None:
         if record.phase != self.phases:
@@ -238,6 +285,8 @@ class RunChecks:
         """Report what never came, and add remarks on what is no fault."""
         for commit in self._waiting:
             self._commit(*commit)
+        for numbers in self._scorers.values():
+            numbers.finish(place)
         for source in self.sources.values():
             source.finish(self.phases > 0, place)
             if self.phases and source.tail:

@@ -35,6 +35,7 @@ from codetr_ros.config.methods import (
     RrdSettings,
     SacSettings,
 )
+from codetr_ros.config.people import PeopleSettings
 from codetr_ros.config.run import Settings
 from codetr_ros.config.threads import settled
 from codetr_ros.config.usual import USUAL, from_text
@@ -57,6 +58,7 @@ __all__ = [
     'Method',
     'MilLstmSettings',
     'MlpSettings',
+    'PeopleSettings',
     'PerceptronSettings',
     'RbtSettings',
     'RrdSettings',

@@ -34,6 +34,8 @@ Method = Literal[
     'ones',
 ]
 
+Scorer = Literal['simulator', 'person', 'topic', 'simulated']
+
 IN_PROCESS_ONLY = {
     'true': 'is a reference that looks at true rewards, which no node may see',
     'ones': 'is a reference that ignores the scores',

@@ -1,13 +1,15 @@
 """How many messages may be under way on each topic, and so how deep its queues are.
 
-Topics that a late node must still receive (`run`, `task`, `policy`, `commits`) are transient
-local. Every queue is deeper than the number of messages that the permitted phases can put on its
-topic: KEEP_LAST would drop the rest silently, and KEEP_ALL blocks the publisher. The depth is
-`max(FLOOR, MARGIN * most)`. The table gives `most` for P = ahead + 1 phases (one more than are
-ever permitted and not yet committed) of N = phase_steps steps, all sources together:
+Topics that a late node must still receive (`run`, `task`, `policy`, `commits`, `score_requests`)
+are transient local. Every queue is deeper than the number of messages that the permitted phases
+can put on its topic: KEEP_LAST would drop the rest silently, and KEEP_ALL blocks the publisher.
+The depth is `max(FLOOR, MARGIN * most)`. The table gives `most` for P = ahead + 1 phases (one more
+than are ever permitted and not yet committed) of N = phase_steps steps, all sources together:
 
     transitions, true_rewards   P * N                       a chunk has at least one step
-    composite_rewards           P * N                       a segment has at least one step
+    composite_rewards           P * N                       a segment has at least one step, and
+                                                            no scorer may give more
+    preferences                 P * N                       no scorer may give more
     episodes                    P * N + evaluate_episodes   an episode has at least one step
     step_rewards                P * (sources + ceil(16 * memory_steps / 100 kB))
                                                             at most 4 bytes for each label and 12
@@ -16,7 +18,7 @@ ever permitted and not yet committed) of N = phase_steps steps, all sources toge
     metrics                     P * (4 + simulators) * 4    a few from each node and phase
     policy                      P + ceil(4000 / N)          those that come during an evaluation
                                                             episode are added
-    commits                     P                           one for each phase
+    commits, score_requests     P                           one for each phase
     task                        sources                     one for each source
 
 A depth costs nothing by itself: the middleware stores messages that were published and reserves
@@ -59,7 +61,9 @@ QUALITIES: dict[str, Quality] = {
     'policy': Quality(True, lambda s: _phases(s) + ceil(4000 / s.phase_steps)),
     'transitions': Quality(False, _steps),
     'composite_rewards': Quality(False, _steps),
+    'preferences': Quality(False, _steps),
     'commits': Quality(True, _phases),
+    'score_requests': Quality(True, _phases),
     'step_rewards': Quality(
         False,
         lambda s: _phases(s) * (s.source_count + ceil(16 * s.memory_steps / HALF_A_PART)),

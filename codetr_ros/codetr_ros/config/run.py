@@ -14,7 +14,7 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from codetr_ros.config.base import Group, SettingsError, flatten, in_words, validate
-from codetr_ros.config.choices import SCORE_LEARNERS, Composite, Method
+from codetr_ros.config.choices import SCORE_LEARNERS, Composite, Method, Scorer
 from codetr_ros.config.delays import Delay, Delayed
 from codetr_ros.config.methods import (
     AggregateSettings,
@@ -30,6 +30,7 @@ from codetr_ros.config.methods import (
     RrdSettings,
     SacSettings,
 )
+from codetr_ros.config.people import PeopleSettings, Scored
 from codetr_ros.config.schedule import ROBOT, Schedule
 from codetr_ros.config.threads import Threaded, Threads
 from codetr_ros.records import PROTOCOL_VERSION, RunSpec
@@ -39,7 +40,7 @@ _DEVICE = in_words(
 )
 
 
-class Settings(Schedule, Delayed, Threaded, Group):
+class Settings(Schedule, Delayed, Scored, Threaded, Group):
     """Everything that the nodes of a run must agree on."""
 
     task: str = Field(
@@ -78,6 +79,22 @@ class Settings(Schedule, Delayed, Threaded, Group):
         le=1000,
         description='levels of an ordinal scale on which segments are scored, 1 (worst) to so '
         "many, as many of the random policy's scores on each; 0: scores are numbers",
+    )
+    scorer: Scorer = Field(
+        'simulator',
+        description='who scores segments: the simulator; a person on a page, who may come and go; '
+        'whoever publishes on the topic (topic); or simulated people. All but the simulator score '
+        'when they like and as much as they like, and the run waits for none of them',
+    )
+    requests: int = Field(
+        8,
+        ge=0,
+        le=1000,
+        description='segments whose scores are asked for after each phase, those worth most '
+        'first, where another than the simulator scores',
+    )
+    people: PeopleSettings = Field(
+        default_factory=PeopleSettings, description='simulated people, with `scorer` simulated'
     )
     method: Method = Field(
         'codetr', description='how step rewards are made from composite rewards'
@@ -209,6 +226,23 @@ class Settings(Schedule, Delayed, Threaded, Group):
             raise ValueError(
                 'score_levels=1: a scale of one level says nothing of a segment; set 2 or more, '
                 'or 0 for scores that are numbers'
+            )
+        return self
+
+    @model_validator(mode='after')
+    def _only_a_simulator_is_told_how_to_score(self) -> 'Settings':
+        set_ = [n for n in ('score_missing', 'score_noise', 'score_levels') if getattr(self, n)]
+        if set_ and self.scored_elsewhere:
+            raise ValueError(
+                f'{set_[0]}={getattr(self, set_[0]):g} with scorer={self.scorer}: it is about '
+                'scores of the simulator; leave it out (simulated people have settings of their '
+                'own, people.*)'
+            )
+        if self.scored_elsewhere and self.method == 'lirpg':
+            raise ValueError(
+                f'scorer={self.scorer} with method=lirpg: it learns from each step once, in its '
+                'own phase, when another than the simulator has not scored it yet; set '
+                'scorer=simulator'
             )
         return self
 

@@ -26,6 +26,10 @@ class Schedule:
         evaluate_every: int
 
         @property
+        def scorer(self) -> str:
+            """Who scores segments."""
+
+        @property
         def labels_steps(self) -> bool:
             """Whether a reward method labels steps."""
 

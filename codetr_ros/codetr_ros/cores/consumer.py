@@ -19,6 +19,7 @@ from codetr_ros.config import Settings
 from codetr_ros.cores import going_on
 from codetr_ros.cores.core import Part
 from codetr_ros.cores.intake import Intake
+from codetr_ros.memory.judgements import Predict
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import Metrics, Record, RunSpec
 from codetr_ros.runs import checkpoints
@@ -57,6 +58,7 @@ class Consumer(Part, ABC):
         self._settings = settings
         self._name = name
         self._folder = folder
+        self._scores = scores
         self._true_rewards = true_rewards
         self._intake = Intake(run, settings, scores, true_rewards)
         self._memory: Trajectories | None = None
@@ -132,6 +134,7 @@ class Consumer(Part, ABC):
             self._true_rewards,
             regular=not settings.lengths.drawn,
             progress=settings.progress,
+            cuts=settings.cuts if settings.scored_elsewhere and self._scores else None,
         )
         yield from self._begin()
         if self._from is not None:
@@ -139,6 +142,7 @@ class Consumer(Part, ABC):
         for phase in range(self._phase, settings.phases):
             while not self._intake.take(phase, self._memory):
                 yield None
+            self._memory.settle(self._predict)
             # the phases of the warm-up are stored, and learnt from at its end
             learns = phase >= settings.warmup_phases - 1
             yield from self._learn(phase, self._memory, learns)
@@ -177,6 +181,11 @@ class Consumer(Part, ABC):
     @abstractmethod
     def _restore(self, checkpoint: Checkpoint) -> list[Record]:
         """Go on as in a checkpoint; the records that were published after its phase."""
+
+    @property
+    def _predict(self) -> Predict | None:
+        """What the reward model expects of segments; None: there is none, or it knows nothing."""
+        return None
 
     @abstractmethod
     def _learn(

@@ -19,6 +19,7 @@ from codetr_ros.cores.core import Core
 from codetr_ros.cores.evaluator import Evaluator
 from codetr_ros.cores.labeller import Labeller
 from codetr_ros.cores.learner import Learner
+from codetr_ros.cores.people import SimulatedPeople
 from codetr_ros.cores.recorder import Recorder
 from codetr_ros.cores.recording import RunBag
 from codetr_ros.cores.simulator import Simulator
@@ -76,6 +77,7 @@ class Parts:
         self.simulators = {
             name: Simulator(spec, settings, name) for name in settings.simulator_names
         }
+        self.people = SimulatedPeople(spec, settings) if settings.scorer == 'simulated' else None
         self.recorder = Recorder(spec, settings, 'record')
         self.reward = (
             Labeller(spec, settings, 'reward', checkpoints) if settings.labels_steps else None
@@ -84,6 +86,7 @@ class Parts:
         self.evaluator = Evaluator(spec, settings, 'evaluate')
         cores: dict[str, tuple[str, Core[Record]]] = {
             **{name: ('sim', core) for name, core in self.simulators.items()},
+            **({'score': ('score', self.people)} if self.people is not None else {}),
             'record': ('record', self.recorder),
             **({'reward': ('reward', self.reward)} if self.reward is not None else {}),
             'learner': ('learner', self.learner),

@@ -13,6 +13,7 @@ from codetr_ros.records import (
     TOPICS,
     Commit,
     CompositeReward,
+    Preference,
     Record,
     RecordError,
     RunSpec,
@@ -21,7 +22,8 @@ from codetr_ros.records import (
     TrueRewards,
     describe,
 )
-from codetr_ros.records.checks import check_run, check_score
+from codetr_ros.records.checks import check_preference, check_run, check_score
+from codetr_ros.records.numbering import Judgement
 
 _log = logging.getLogger(__name__)
 
@@ -45,7 +47,9 @@ class Intake:
         self._true_rewards = true_rewards
         self.tasks = Tasks(run, settings)
         self._transitions: dict[tuple[str, int], Transitions] = {}
-        self._rewards: dict[tuple[str, int], CompositeReward] = {}
+        self._rewards: dict[tuple[str, int], Judgement] = {}
+        # judgements committed before all of their steps are, with the phase of that commit
+        self._early: list[tuple[int, Judgement]] = []
         self._true: dict[tuple[str, int], TrueRewards] = {}
         self._commits: dict[int, Commit] = {}
         self._taken = {
@@ -70,14 +74,19 @@ class Intake:
                 key = (record.source, record.sequence)
                 self._hold(record, self._transitions, key, self._taken['transitions'])
         elif isinstance(record, CompositeReward):
-            check_score(record, self._settings.scored_at_most, self._settings.score_missing > 0)
-            self._hold(
-                record, self._rewards, (record.scorer, record.sequence), self._taken['scores']
-            )
+            check_score(record, self._settings.scored_at_most, self._settings.may_lack_scores)
+            self._hold_judgement(record)
+        elif isinstance(record, Preference):
+            check_preference(record, self._settings.scored_at_most)
+            self._hold_judgement(record)
         elif isinstance(record, TrueRewards):
             self._true[record.source, record.sequence] = record
         elif isinstance(record, Commit):
             self._commits.setdefault(record.phase, record)
+
+    def _hold_judgement(self, record: Judgement) -> None:
+        key = (record.scorer, record.sequence)
+        self._hold(record, self._rewards, key, self._taken['scores'])
 
     def _hold(
         self,
@@ -86,7 +95,7 @@ class Intake:
         key: tuple[str, int],
         taken: 'Counter[str]',
     ) -> None:
-        ahead = (self._settings.ahead + 1) * self._settings.phase_steps
+        ahead = self._settings.judgements_ahead
         if key[1] >= taken[key[0]] + ahead:
             raise RecordError(
                 f'{describe(record)} is out of sequence: the permitted phases hold fewer than '
@@ -129,11 +138,9 @@ class Intake:
             memory.append_true_rewards(self._true.pop(key))
         for reward in scores:
             del self._rewards[reward.scorer, reward.sequence]
-            try:
-                memory.score(reward)
-            except RecordError as error:  # a wrong score is logged, counted and left out
-                self.refused[TOPICS[CompositeReward]] += 1
-                _log.error('%s', error)
+        judgements, self._early = [*self._early, *((phase, each) for each in scores)], []
+        for since, judgement in judgements:
+            self._judge(judgement, memory, since, phase)
         for names, last, kind in (
             (commit.sources, commit.transitions, 'transitions'),
             (commit.scorers, commit.scores, 'scores'),
@@ -142,6 +149,20 @@ class Intake:
                 self._taken[kind][name] = number + 1
         memory.evict()
         return True
+
+    def _judge(self, judgement: Judgement, memory: Trajectories, since: int, phase: int) -> None:
+        """Add a judgement to the memory, or keep it until its steps are there.
+
+        They are of a phase that is permitted, and so are there with a commit soon.
+        """
+        if memory.awaited(judgement) and phase < since + self._settings.ahead + 1:
+            self._early.append((since, judgement))
+            return
+        try:
+            memory.judge(judgement)
+        except RecordError as error:  # a wrong score is logged, counted and left out
+            self.refused[TOPICS[type(judgement)]] += 1
+            _log.error('%s', error)
 
     def _named(
         self, names: tuple[str, ...], last: Any, held: dict[tuple[str, int], Any], kind: str

@@ -3,6 +3,7 @@
 import time
 from collections import Counter
 from collections.abc import Generator, Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from codetr_ros.config import Settings
 from codetr_ros.cores import going_on, published
 from codetr_ros.cores.consumer import Consumer
 from codetr_ros.memory import due
+from codetr_ros.memory.judgements import Predict
 from codetr_ros.memory.segments import Spans
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import (
@@ -21,12 +23,14 @@ from codetr_ros.records import (
     MESSAGE_BYTES,
     Record,
     RunSpec,
+    ScoreRequest,
     StepRewards,
     TrueRewards,
 )
 from codetr_ros.records.roles import subscribed
 from codetr_ros.rewards import registry, saved
-from codetr_ros.rewards.base import ModelFacts, RewardMethod, RewardModelError
+from codetr_ros.rewards.asking import worth_asking
+from codetr_ros.rewards.base import ModelFacts, Predictor, RewardMethod, RewardModelError
 from codetr_ros.runs import checkpoints
 from codetr_ros.runs.checkpoints import Checkpoint
 from codetr_ros.runs.reports import CoreReport, StartedFrom
@@ -110,9 +114,10 @@ class Labeller(Consumer):
         if not learns:
             self._phase = phase + 1
             # published for every phase, because the player of a recorded run waits for it
-            yield [self._metrics(phase, {'gradient_steps': method.gradient_steps})]
+            values = {'gradient_steps': method.gradient_steps}
+            yield [*self._asked(phase, memory, method), self._metrics(phase, values)]
             return
-        if len(memory.segments.ids()) and not self._frozen:
+        if self._informed(memory, method) and not self._frozen:
             method.prepare(memory)
         metrics: dict[str, float] = {}
         for means in self._fit(phase, memory, method):
@@ -131,9 +136,49 @@ class Labeller(Consumer):
             'gradient_steps': method.gradient_steps,
             'label_seconds': time.perf_counter() - began,
         }
+        metrics |= self._of_scorers(memory, method)
         self._phase = phase + 1
         self._given = published.numbered(self._run.run_id, phase, method.version, parts)
-        yield [*self._given, self._metrics(phase, metrics)]
+        yield [
+            *self._given,
+            *self._asked(phase, memory, method),
+            self._metrics(phase, metrics),
+        ]
+
+    @property
+    def _predict(self) -> Predict | None:
+        known = isinstance(self._method, Predictor) and self._method.target_scale > 0
+        return self._method.predict if known else None  # type: ignore[union-attr]
+
+    def _informed(self, memory: Trajectories, method: RewardMethod) -> bool:
+        """Whether there is anything to learn or to label from."""
+        pairs = method.uses_preferences
+        if method.target_scale:  # it has begun
+            judgements = memory.judgements if pairs else None
+            return bool(len(memory.segments.ids()) or (judgements and len(judgements.pairs())))
+        return memory.informed(pairs)
+
+    def _asked(
+        self, phase: int, memory: Trajectories, method: RewardMethod
+    ) -> Iterator[ScoreRequest]:
+        """What scorers are asked for, where others than the simulator score."""
+        if memory.judgements is None or not self._settings.requests:
+            return
+        knows = method if method.target_scale else None
+        yield worth_asking(memory, knows, self._settings, self._run.run_id, phase)
+
+    def _of_scorers(self, memory: Trajectories, method: RewardMethod) -> dict[str, float]:
+        """What is known of each scorer, where others than the simulator score."""
+        if memory.judgements is None:
+            return {}
+        facts = memory.judgements.facts()
+        pairs = sum(fact.preferences for fact in facts.values())
+        if pairs and not method.uses_preferences:
+            self._counters['preferences not used, method cannot'] = pairs
+        known = {'segments_scored': float(len(memory.segments.ids()))}
+        for name, fact in facts.items():
+            known |= {f'scorer_{name}_{what}': float(n) for what, n in asdict(fact).items()}
+        return known
 
     def _fit(
         self, phase: int, memory: Trajectories, method: RewardMethod
@@ -141,7 +186,7 @@ class Labeller(Consumer):
         steps = method.schedule.each if self._fitted else method.schedule.first
         if self._frozen:
             return
-        if steps and not len(memory.segments.ids()):
+        if steps and not self._informed(memory, method):
             self._counters['gradient steps skipped, nothing scored'] += steps
             return
         self._fitted = True
@@ -166,7 +211,7 @@ class Labeller(Consumer):
         labelled, by which version, and which the learner will draw.
         """
         segments = due.segments_due(memory, method.version, self._settings)
-        if len(segments) and not len(memory.segments.ids()):  # nothing is known yet
+        if len(segments) and not self._informed(memory, method):  # nothing is known yet
             self._counters['segments not labelled, nothing scored'] += len(segments)
             return
         yield from self._whole(phase, memory, method, segments)

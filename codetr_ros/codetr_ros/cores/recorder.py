@@ -4,8 +4,9 @@ The core knows nothing of bags. Its wiring writes every received record to disk 
 a `Commit`. So no record that a node learns from is ever lost.
 """
 
+import logging
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from typing import Any
 
@@ -19,6 +20,7 @@ from codetr_ros.records import (
     Commit,
     CompositeReward,
     Policy,
+    Preference,
     Record,
     RecordError,
     RunSpec,
@@ -27,12 +29,18 @@ from codetr_ros.records import (
     describe,
     metrics,
 )
-from codetr_ros.records.checks import check_run, check_score
+from codetr_ros.records.checks import check_preference, check_run, check_score
+from codetr_ros.records.numbering import Judgement, Numbering
 from codetr_ros.runs.reports import CoreReport
+
+_log = logging.getLogger(__name__)
 
 
 class Recorder(Part):
     """Commits a phase once every permitted step and every due composite reward has arrived.
+
+    Only a simulator's scores are due. Where another scores (setting `scorer`), a commit names the
+    judgements that are there, and late ones join a later commit.
 
     Args:
         run: the run.
@@ -40,7 +48,7 @@ class Recorder(Part):
         name: node name.
     """
 
-    subscribes: tuple[type, ...] = (TaskSpec, Policy, Transitions, CompositeReward)
+    subscribes: tuple[type, ...] = (TaskSpec, Policy, Transitions, CompositeReward, Preference)
 
     def __init__(self, run: RunSpec, settings: Settings, name: str) -> None:
         super().__init__()
@@ -53,6 +61,7 @@ class Recorder(Part):
         self._ended: dict[tuple[int, str], tuple[int, int]] = {}  # -> last sequence, scores due
         self._transitions: Counter[str] = Counter()  # next sequence number of each source
         self._scores: Counter[str] = Counter()  # next sequence number of each scorer
+        self._numbers: defaultdict[str, Numbering] = defaultdict(Numbering)
         self._committed_scores: Counter[str] = Counter()
         self.refused = self._tasks.refused
         self.phase = 0  # the next to be committed
@@ -84,8 +93,39 @@ class Recorder(Part):
                 if record.phase_end:
                     self._ended[record.phase, record.source] = (record.sequence, record.scores_due)
         elif isinstance(record, CompositeReward):
-            check_score(record, self._settings.scored_at_most, self._settings.score_missing > 0)
-            self._next(record, self._scores, record.scorer)
+            check_score(record, self._settings.scored_at_most, self._settings.may_lack_scores)
+            if self._settings.scored_elsewhere:
+                self._judged(record)
+            else:
+                self._next(record, self._scores, record.scorer)
+        elif isinstance(record, Preference):
+            check_preference(record, self._settings.scored_at_most)
+            if not self._settings.scored_elsewhere:
+                raise RecordError(
+                    f'{describe(record)} of {record.scorer!r}: the simulator scores in this run, '
+                    'so nobody compares; start the run with scorer=topic'
+                )
+            self._judged(record)
+
+    def _judged(self, record: Judgement) -> None:
+        """Note a judgement; its scorer's earlier ones may still be on their way."""
+        name, numbers = record.scorer, self._numbers[record.scorer]
+        most = self._committed_scores[name] + self._settings.judgements_ahead
+        if record.sequence >= most:
+            raise RecordError(
+                f'{describe(record)} is out of sequence: {numbers.next} is the next of {name!r}, '
+                f'and a scorer may give {self._settings.judgements_ahead} judgements between two '
+                'commits. Number them from 0 on, without gaps'
+            )
+        if not numbers.take(record.sequence):
+            self.duplicated[TOPICS[type(record)]] += 1
+            return
+        if len(numbers.early) == 1 and record.sequence in numbers.early:
+            _log.warning(
+                '%s of %r waits for number %s, which has not arrived: nothing is learnt from it '
+                'before', describe(record), name, numbers.next,
+            )  # fmt: skip
+        self._scores[name] = numbers.next
 
     def restore(self, record: Record) -> None:
         """Take one of the records that the bag holds already, in the bag's order, commits among
@@ -218,5 +258,12 @@ class Recorder(Part):
         return CoreReport(
             duplicated=dict(self.duplicated),
             refused=dict(self.refused),
-            counters={'phases_committed': self.phase},
+            counters={'phases_committed': self.phase} | self._left_over(),
         )
+
+    def _left_over(self) -> dict[str, int]:
+        """Judgements that no commit has named: they came too late, or after a gap."""
+        gaps = sum(len(numbers.early) for numbers in self._numbers.values())
+        late = sum(n.next - self._committed_scores[name] for name, n in self._numbers.items())
+        counts = {'judgements after the last commit': late, 'judgements after a gap': gaps}
+        return {name: count for name, count in counts.items() if count}

@@ -4,20 +4,25 @@ A segment has an id, (place of its source in the order of names << 40) | its num
 source. Arrays of ids (B,) may be in any order.
 """
 
-from collections.abc import Callable, Iterator
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from codetr_ros.config.cuts import Cuts
 from codetr_ros.memory.batches import SegmentBatch
 from codetr_ros.memory.ring import SourceRing, ranges
 from codetr_ros.memory.scoring import anywhere, one_after_another, unscored
 from codetr_ros.memory.store import Store
 from codetr_ros.memory.table import SegmentTable
-from codetr_ros.records import F64, I64, CompositeReward
+from codetr_ros.records import F64, I64, CompositeReward, RecordError, Transitions
 
 SOURCE_SHIFT = 40
 """Bits of an id that hold the number of the segment within its source."""
+
+Place = tuple[str, int]
+"""A segment for as long as it is held: its source, and its number within the source."""
 
 Spans = list[tuple[str, I64, I64, I64]]
 """For each source its name, and for each of its spans of steps the episode, the number of the
@@ -54,6 +59,26 @@ class Segments:
         source.scored.add(row, reward.length, reward.first_step, reward.episode, reward.value)
         self.forget()
 
+    def add_unscored(self, chunk: Transitions, cuts: Cuts) -> None:
+        """Add the segments that end with steps that are here, without a score yet."""
+        source = self._store.source(chunk.source)
+        assert source is not None
+        start = source.by_number[chunk.episode].start
+        after = chunk.first_step + chunk.steps
+        ended = chunk.terminated or chunk.truncated
+        cut = cuts.segments(chunk.source, chunk.episode, chunk.first_step, after, ended)
+        for first, length in cut:
+            source.scored.add(start + first, length, first, chunk.episode, np.nan)
+        self.forget()
+
+    def value(self, values: Mapping[Place, float]) -> None:
+        """Set the scores of segments that are held; NaN: none."""
+        for (name, number), value in values.items():
+            source = self._store.source(name)
+            assert source is not None
+            source.scored.values[number - source.scored.first] = value
+        self.forget()
+
     def forget(self) -> None:
         """Drop the lists of ids: they are made anew when they are next needed."""
         self._ids = self._all_ids = None
@@ -72,6 +97,59 @@ class Segments:
         if self._all_ids is None:
             self._all_ids = self._joined(lambda table: table.numbers())
         return self._all_ids
+
+    def unscored_ids(self) -> I64:
+        """Ids of those that have no score."""
+        rest: I64 = np.setdiff1d(self.all_ids(), self.ids())
+        return rest
+
+    def digest(self) -> int:
+        """A number by which the scores of other segments, or other scores, are told from these."""
+        ids = self.ids()
+        digest = hashlib.sha256(ids.tobytes() + self.scores(ids).tobytes()).digest()
+        return int.from_bytes(digest[:8], 'little', signed=True)
+
+    def newest_first(self, ids: I64) -> I64:
+        """The same ids, the newest of each source first."""
+        ends = np.searchsorted(ids >> SOURCE_SHIFT, ids >> SOURCE_SHIFT, side='right')
+        ordered: I64 = ids[np.lexsort((ids, ends - np.arange(len(ids))))]
+        return ordered
+
+    def place(self, source: str, episode: int, first: int, length: int, scorer: str) -> Place:
+        """The segment of these steps, which was added without a score.
+
+        Raises:
+            RecordError: there is none.
+        """
+        ring = self._store.source(source)
+        stored = ring.by_number.get(episode) if ring else None
+        named = f'{scorer!r} judges {source!r}, episode {episode}, steps {first} to '
+        named += f'{first + length - 1}'
+        if ring is None or stored is None:
+            raise RecordError(
+                f'{named}: no such episode is here (never sent, or evicted); judge segments of '
+                'steps sent'
+            )
+        number = ring.scored.beginning_at(stored.start + first) if first < stored.steps else None
+        if number is None or ring.scored.lengths[number - ring.scored.first] != length:
+            raise RecordError(
+                f'{named}: there is no such segment; judge those of a ScoreRequest, or cut '
+                f'episodes as the setting delay does ({self._delay} steps at the most)'
+            )
+        return source, number
+
+    def holds(self, place: Place) -> bool:
+        """Whether a segment is still held."""
+        source = self._store.source(place[0])
+        if source is None:
+            return False
+        at = place[1] - source.scored.first
+        return at >= 0 and bool(source.scored.alive[at])
+
+    def ids_of(self, places: Sequence[Place]) -> I64:
+        """Ids of segments that are held."""
+        index = {ring.name: i for i, ring in enumerate(self._store.by_name())}
+        return np.array([n | index[name] << SOURCE_SHIFT for name, n in places], np.int64)
 
     def _joined(self, numbers: Callable[[SegmentTable], I64]) -> I64:
         rings = enumerate(self._store.by_name())

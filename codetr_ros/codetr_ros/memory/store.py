@@ -138,6 +138,14 @@ class Store:
         """A source's steps; None if it sent none."""
         return self._sources.get(name)
 
+    def awaits(self, name: str, episode: int, steps: int) -> bool:
+        """Whether an episode has not come, or has fewer than so many steps so far and goes on."""
+        source = self._sources.get(name)
+        newest = source.newest if source else None
+        if newest is None or episode > newest.number:
+            return True
+        return episode == newest.number and not newest.ended and newest.steps < steps
+
     @property
     def steps(self) -> int:
         """Steps held."""

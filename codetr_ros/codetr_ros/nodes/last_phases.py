@@ -1,13 +1,14 @@
 """The last phases of a run, as the recorder keeps them for a node that lacks some of them."""
 
-from codetr_ros.records import Commit, CompositeReward, Record, Transitions
+from codetr_ros.bags.causal import named, publisher
+from codetr_ros.records import Commit, CompositeReward, Preference, Record, Transitions
 
 
 class LastPhases:
     """The received bytes of the last committed phases, and of records that no commit names yet."""
 
     def __init__(self, phases: int) -> None:
-        self._open: dict[tuple[type, str, int], bytes] = {}
+        self._open: dict[tuple[type, str, int], tuple[type, bytes]] = {}
         self._committed: dict[int, list[tuple[type, bytes]]] = {}
         self._phases = phases
 
@@ -17,25 +18,15 @@ class LastPhases:
         The first of a number stays: steps that arrive before their source is announced are checked
         later, so that a second one of the same number may be one that the core then refuses.
         """
-        if isinstance(record, Transitions):
-            self._open.setdefault((Transitions, record.source, record.sequence), raw)
-        elif isinstance(record, CompositeReward):
-            self._open.setdefault((CompositeReward, record.scorer, record.sequence), raw)
+        if isinstance(record, (Transitions, CompositeReward, Preference)):
+            key = (*publisher(record), record.sequence)
+            self._open.setdefault(key, (type(record), raw))
 
     def commit(self, commit: Commit, raw: bytes) -> None:
         """File the records that a commit names under its phase; forget the oldest phase."""
-        last: dict[tuple[type, str], int] = {
-            (Transitions, s): n
-            for s, n in zip(commit.sources, commit.transitions.tolist(), strict=True)
-        }
-        last |= {
-            (CompositeReward, s): n
-            for s, n in zip(commit.scorers, commit.scores.tolist(), strict=True)
-        }
-        named = [key for key in self._open if key[2] <= last.get(key[:2], -1)]
-        self._committed[commit.phase] = [(key[0], self._open.pop(key)) for key in named] + [
-            (Commit, raw)
-        ]
+        last = named(commit)
+        keys = [key for key in self._open if key[2] <= last.get(key[:2], -1)]
+        self._committed[commit.phase] = [self._open.pop(key) for key in keys] + [(Commit, raw)]
         while len(self._committed) > self._phases:
             del self._committed[min(self._committed)]
 

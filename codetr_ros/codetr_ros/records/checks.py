@@ -3,7 +3,9 @@
 import numpy as np
 
 from codetr_ros.records import (
+    OUTCOMES,
     CompositeReward,
+    Preference,
     Record,
     RecordError,
     RunSpec,
@@ -92,4 +94,33 @@ def check_score(reward: CompositeReward, delay: int, missing: bool = False) -> N
     if not 1 <= reward.length <= delay:
         raise RecordError(
             f'{describe(reward)}: length is {reward.length}: a segment has 1 to {delay} steps'
+        )
+
+
+def check_preference(preference: Preference, delay: int) -> None:
+    """Refuse a preference that nobody can have.
+
+    Args:
+        preference: the record.
+        delay: the most steps of a segment.
+
+    Raises:
+        RecordError: names the field and its value.
+    """
+    outcome = preference.outcome
+    if outcome not in OUTCOMES and not np.isnan(outcome):
+        raise RecordError(
+            f'{describe(preference)}: outcome is {outcome}: must be 1 (the first segment is '
+            'better), 0 (the second), 0.5 (both are as good) or NaN (cannot decide)'
+        )
+    for name in ('length', 'other_length'):
+        if not 1 <= getattr(preference, name) <= delay:
+            raise RecordError(
+                f'{describe(preference)}: {name} is {getattr(preference, name)}: a segment has 1 '
+                f'to {delay} steps'
+            )
+    first = (preference.source, preference.episode, preference.first_step)
+    if first == (preference.other_source, preference.other_episode, preference.other_first_step):
+        raise RecordError(
+            f'{describe(preference)} compares a segment with itself: compare two of them'
         )

@@ -15,6 +15,7 @@ from codetr_ros.records import (
     Presence,
     Record,
     RecordError,
+    ScoreRequest,
     StepRewards,
     Transitions,
     TrueRewards,
@@ -36,6 +37,7 @@ _PARALLEL: dict[type, tuple[tuple[str, ...], ...]] = {
     Policy: (('sources', 'steps'),),
     Commit: (('sources', 'transitions'), ('scorers', 'scores')),
     StepRewards: (('episodes', 'first_steps', 'lengths'),),
+    ScoreRequest: (('sources', 'episodes', 'first_steps', 'lengths', 'worths'),),
     Metrics: (('names', 'values'),),
 }
 """Names of arrays: each must be as long as the first of its row."""

@@ -36,6 +36,10 @@ phase k.
 """
 
 
+FIRST, EQUAL, SECOND = OUTCOMES = (1.0, 0.5, 0.0)
+"""Outcomes of a preference: which of the two segments is better."""
+
+
 class RecordError(ValueError):
     """A record that must be refused: names value, field, source and remedy."""
 
@@ -135,11 +139,29 @@ class CompositeReward:
     run_id: str
     source: str  # the source of the segment
     scorer: str  # the name of its scorer
-    sequence: int  # 0, 1, 2, ... for each scorer
+    sequence: int  # 0, 1, 2, ... for each scorer, scores and preferences together
     episode: int
     first_step: int
     length: int
-    value: float  # NaN: the segment has no score (`score_missing`)
+    value: float  # NaN: the segment has no score (`score_missing`), or its scorer cannot tell
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Preference:
+    """Which of two segments is better. From its scorer to recorder, reward or learner."""
+
+    run_id: str
+    scorer: str  # the name of its scorer
+    sequence: int  # among the numbers of its scorer's scores
+    source: str  # the source of the first segment
+    episode: int
+    first_step: int
+    length: int
+    other_source: str  # the source of the second segment
+    other_episode: int
+    other_first_step: int
+    other_length: int
+    outcome: float  # one of `OUTCOMES`; NaN: the scorer cannot decide
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -183,6 +205,21 @@ class StepRewards:
     lengths: U32  # (S,)
     labels: F32  # (sum of lengths,) segment after segment
     commit: str = ''  # digest of the phase's commit, of which they were made
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class ScoreRequest:
+    """The segments whose scores are worth most, the most valuable first. From reward to scorers,
+    recorder and people.
+    """
+
+    run_id: str
+    phase: int
+    sources: tuple[str, ...]
+    episodes: U32  # (len(sources),)
+    first_steps: U32  # (len(sources),)
+    lengths: U32  # (len(sources),)
+    worths: F32  # (len(sources),) how far each score may be off; NaN: not known
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -237,8 +274,10 @@ Record = (
     | Policy
     | Transitions
     | CompositeReward
+    | Preference
     | Commit
     | StepRewards
+    | ScoreRequest
     | EpisodeResult
     | TrueRewards
     | Metrics
@@ -251,8 +290,10 @@ TOPICS: dict[type, str] = {
     Policy: 'policy',
     Transitions: 'transitions',
     CompositeReward: 'composite_rewards',
+    Preference: 'preferences',
     Commit: 'commits',
     StepRewards: 'step_rewards',
+    ScoreRequest: 'score_requests',
     EpisodeResult: 'episodes',
     TrueRewards: 'true_rewards',
     Metrics: 'metrics',

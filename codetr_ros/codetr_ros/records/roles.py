@@ -17,8 +17,10 @@ from codetr_ros.records.kinds import (
     EpisodeResult,
     Metrics,
     Policy,
+    Preference,
     Presence,
     RunSpec,
+    ScoreRequest,
     StepRewards,
     TaskSpec,
     Transitions,
@@ -40,6 +42,10 @@ class DecidingSettings(Protocol):
     @property
     def labels_steps(self) -> bool:
         """Whether a reward node labels steps, from which the policy is then learnt."""
+
+    @property
+    def scorer(self) -> str:
+        """Who scores segments."""
 
 
 @dataclass(frozen=True)
@@ -83,8 +89,8 @@ TABLE: dict[str, Role] = {
     ),
     'reward': Role(
         'reward_node', 'reward',
-        publishes=(StepRewards, Metrics),
-        reads=(RunSpec, TaskSpec, Transitions, CompositeReward, Commit),
+        publishes=(StepRewards, ScoreRequest, Metrics),
+        reads=(RunSpec, TaskSpec, Transitions, CompositeReward, Preference, Commit),
         relies_on=('record',),
         count=lambda settings: int(settings.labels_steps),
     ),
@@ -92,8 +98,16 @@ TABLE: dict[str, Role] = {
         'learner_node', 'learner',
         publishes=(RunSpec, Policy, Metrics),
         reads=(TaskSpec, Transitions, Commit, StepRewards),
-        reads_unlabelled=(TaskSpec, Transitions, CompositeReward, Commit),
+        reads_unlabelled=(TaskSpec, Transitions, CompositeReward, Preference, Commit),
         relies_on=('reward', 'record'),
+    ),
+    'score': Role(
+        'codetr_ros', 'score',
+        publishes=(CompositeReward, Preference),
+        reads=(RunSpec, TaskSpec, Transitions, TrueRewards, ScoreRequest, Commit),
+        relies_on=('sim', 'record'),
+        # nobody waits for a person, who may come and go
+        count=lambda settings: int(settings.scorer == 'simulated'),
     ),
     'record': Role(
         'codetr_ros', 'record',

@@ -57,6 +57,8 @@ class RewardMethod(ABC):
     """
     needs_true_rewards: ClassVar[bool] = False
     """Whether its memory must hold the environment's own rewards."""
+    uses_preferences: ClassVar[bool] = False
+    """Whether it learns from which of two segments is better, too."""
     context: int = 0
     """Steps before a segment that `label` needs in its batches: pass it to `Segments.batch`."""
     label_batch: int = 256
@@ -147,6 +149,12 @@ class RewardMethod(ABC):
 
     def step_deviations(self, batch: SegmentBatch) -> F32 | None:
         """How far each label (B, L) may be off, one standard deviation; None if not known."""
+        return None
+
+    def doubt(self, batch: SegmentBatch) -> F64 | None:
+        """Covariance (B, B) of how far the levels of segments' scores may be off, in the squared
+        unit of labels, as far as scores of others can tell; None if not known.
+        """
         return None
 
     def step_weights(self, batch: SegmentBatch) -> F32 | None:

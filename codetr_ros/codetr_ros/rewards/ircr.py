@@ -40,7 +40,7 @@ from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import F32
 from codetr_ros.rewards.base import RewardMethod, segment_steps
 from codetr_ros.rewards.evidence import links
-from codetr_ros.rewards.unscored import completed
+from codetr_ros.rewards.unscored import LateScores, completed
 
 
 class Ircr(RewardMethod):
@@ -51,13 +51,14 @@ class Ircr(RewardMethod):
     def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
         super().__init__(settings, observation_size, action_size)
         self._link = links.make(settings.composite, settings.beta, settings.longest)
+        self._late = LateScores(settings)
         self._moves = 0
         self._least = self._greatest = 0.0  # meaningless before the first move
 
     @property
     def version(self) -> int:
-        """Phases in which an extreme has moved."""
-        return self._moves
+        """Phases in which an extreme has moved, and those in which late scores were others."""
+        return self._moves + self._late.version
 
     @property
     def unit(self) -> float:
@@ -74,6 +75,7 @@ class Ircr(RewardMethod):
         if not self._moves or extremes != (self._least, self._greatest):
             self._least, self._greatest = extremes
             self._moves += 1
+        self._late.note(memory)
 
     def _completed(self, memory: Trajectories, batch: SegmentBatch) -> SegmentBatch:
         whole = completed(memory, batch, self._link)
@@ -93,6 +95,7 @@ class Ircr(RewardMethod):
             'version': torch.tensor(self._moves, dtype=torch.int64),
             'least': torch.tensor(self._least, dtype=torch.float64),
             'greatest': torch.tensor(self._greatest, dtype=torch.float64),
+            **self._late.state(),
         }
 
     def load_state(self, state: Mapping[str, torch.Tensor]) -> None:
@@ -103,4 +106,5 @@ class Ircr(RewardMethod):
         """
         super().load_state(state)
         self._moves = int(state['version'])
+        self._late.load_state(state)
         self._least, self._greatest = float(state['least']), float(state['greatest'])

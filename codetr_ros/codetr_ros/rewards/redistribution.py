@@ -22,7 +22,7 @@ from codetr_ros.records import F32, F64
 from codetr_ros.rewards.base import RewardMethod, RewardModelError, segment_steps
 from codetr_ros.rewards.evidence import links
 from codetr_ros.rewards.evidence.link import Sum, level_scale
-from codetr_ros.rewards.unscored import completed
+from codetr_ros.rewards.unscored import LateScores, completed
 from codetr_ros.seeding import generator
 
 
@@ -35,6 +35,30 @@ class Redistribution(RewardMethod):
     def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
         super().__init__(settings, observation_size, action_size)
         self._link = links.make(settings.composite, settings.beta, settings.longest)
+        self._late = LateScores(settings)
+
+    @property
+    def version(self) -> int:
+        """Phases in which late scores have changed what segments are labelled by."""
+        return self._late.version
+
+    def prepare(self, memory: Trajectories) -> None:
+        """Freeze the target scale, the first time; note scores that came late."""
+        super().prepare(memory)
+        self._late.note(memory)
+
+    def state(self) -> dict[str, Tensor]:
+        """The target scale, and what is known of late scores."""
+        return super().state() | self._late.state()
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Go on from a `state()`.
+
+        Raises:
+            RewardModelError: it is another method's; nothing has changed then.
+        """
+        super().load_state(state)
+        self._late.load_state(state)
 
     def _completed(self, memory: Trajectories, batch: SegmentBatch) -> SegmentBatch:
         return completed(memory, batch, self._link)

@@ -202,6 +202,10 @@ class CodetrOnEvidence(Codetr):
         rewards = self._base.mean(batch) + self._gate * u
         return self._base.model.scores(rewards, batch.lengths - batch.context)
 
+    def doubt(self, batch: SegmentBatch) -> F64:
+        """What the regression does not know of the levels of segments' scores (B, B)."""
+        return self._base.doubt(batch)
+
     def metrics(self) -> dict[str, float]:
         """What the regression has to publish, the gate, and what it lets in explains."""
         return self._base.metrics() | {'gate': self._gate, 'gate_explains': self._explained}

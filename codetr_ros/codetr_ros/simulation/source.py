@@ -222,7 +222,7 @@ class Source:
             rewards[t], score = episode.step(actions[t])
             t += 1
             observations[t] = episode.observation
-            if score is not None:
+            if score is not None and not self._settings.scored_elsewhere:
                 scores.append(score)
         run_id, source, number = self._run.run_id, self.name, self._episodes
         sequence = self._sequence

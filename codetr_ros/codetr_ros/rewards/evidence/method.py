@@ -14,7 +14,6 @@ is from our trial of the method and what is decided here.
 """
 
 import copy
-import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
@@ -37,7 +36,7 @@ from codetr_ros.rewards.evidence.link import Link
 from codetr_ros.rewards.evidence.maxima import SoftMax
 from codetr_ros.rewards.evidence.model import Model, of_steps
 from codetr_ros.rewards.evidence.sample import Sample, Sampler, chosen
-from codetr_ros.rewards.evidence.uncertainty import deviations
+from codetr_ros.rewards.evidence.uncertainty import deviations, level_covariance
 from codetr_ros.seeding import generator
 from codetr_ros.system.states import check_state
 
@@ -116,7 +115,7 @@ class Evidence(Predictor):
         """
         all_ids = memory.segments.ids()
         scores = memory.segments.scores(all_ids)
-        seen = _digest(all_ids, scores)
+        seen = memory.segments.digest()
         if self._fits and seen == self._seen:
             return
         anew = len(all_ids) >= 2 * self._begun_at
@@ -260,6 +259,14 @@ class Evidence(Predictor):
         steps[inside] = found.steps * factor
         return Uncertainty(steps, found.segments * factor)
 
+    def doubt(self, batch: SegmentBatch) -> F64:
+        """Covariance (B, B) of the levels of segments' scores, of the likelier link's weights."""
+        self._require_prepared()
+        features = [self._features(piece) for piece in _steps(batch, segment_steps(batch))]
+        factor = self._model.scale / self.unit
+        m = batch.lengths - batch.context
+        return level_covariance(self._model, features, m) * factor**2
+
     def step_deviations(self, batch: SegmentBatch) -> F32:
         """How far each label (B, L) may be off, one standard deviation."""
         return self.uncertainty(batch).steps
@@ -376,12 +383,6 @@ class Evidence(Predictor):
         features.waves, features.phases = state['waves'].clone(), state['phases'].clone()
         features.mean, features.std = state['input_mean'].clone(), state['input_std'].clone()
         self._sampler.forget()
-
-
-def _digest(ids: I64, scores: F64) -> int:
-    """A number by which other scores are told from these."""
-    digest = hashlib.sha256(ids.tobytes() + scores.tobytes()).digest()
-    return int.from_bytes(digest[:8], 'little', signed=True)
 
 
 def _steps(batch: SegmentBatch, inside: NDArray[np.bool_]) -> Iterator[F32]:

@@ -31,13 +31,31 @@ def deviations(model: Model, features: list[Tensor], m: I64) -> Deviations:
     """
     step_noise, score_noise = np.exp(model.theta[-2:])
     steps = [model.posterior.variances(piece.double()).numpy() for piece in features]
+    rows, slopes = _level_rows(model, features, m)
+    spread = np.add.reduceat(slopes * slopes, np.cumsum(m) - m)
+    levels = model.posterior.variances(rows).numpy() + step_noise * spread + score_noise
+    return Deviations(np.sqrt(np.concatenate(steps) + step_noise), np.sqrt(levels))
+
+
+def level_covariance(model: Model, features: list[Tensor], m: I64) -> F64:
+    """Covariance (S, S) of segments' levels under the posterior of the weights alone.
+
+    Args:
+        model: a fitted regression.
+        features: (N, D) of the segments' steps, in pieces.
+        m: (S,) the segments' steps.
+    """
+    rows, _ = _level_rows(model, features, m)
+    covariance: F64 = (rows @ model.posterior.covariance @ rows.T).numpy()
+    return covariance
+
+
+def _level_rows(model: Model, features: list[Tensor], m: I64) -> tuple[Tensor, F64]:
+    """What weights are multiplied by for a level (S, D), F linearised, and its slopes (N,)."""
     f = np.concatenate([of_steps(piece, model.posterior.mean) for piece in features])
-    starts = np.cumsum(m) - m
-    slopes = model.link.forward(f, starts, m)[1]
+    slopes = model.link.forward(f, np.cumsum(m) - m, m)[1]
     weights, parts = (
         torch.split(each, m.tolist()) for each in (torch.tensor(slopes), torch.cat(features))
     )
-    rows = torch.stack([w @ part.double() for w, part in zip(weights, parts, strict=True)])
-    spread = np.add.reduceat(slopes * slopes, starts)
-    levels = model.posterior.variances(rows).numpy() + step_noise * spread + score_noise
-    return Deviations(np.sqrt(np.concatenate(steps) + step_noise), np.sqrt(levels))
+    rows = [w @ part.double() for w, part in zip(weights, parts, strict=True)]
+    return torch.stack(rows), slopes
