@@ -24,7 +24,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ import numpy as np
 
 import machine
 import throughput
+from codetr_ros.bags.definitions import decode, encode
 from codetr_ros.config import Settings, load
 from codetr_ros.processes import launcher
 from codetr_ros.records import Commit, CompositeReward, Record, Transitions
@@ -161,12 +162,10 @@ class End:
         from codetr_msgs.msg import CompositeReward as ScoreMessage
         from codetr_msgs.msg import Transitions as StepsMessage
         from rclpy.experimental import EventsExecutor
-        from rclpy.serialization import serialize_message
         from std_msgs.msg import Float64, UInt8MultiArray
 
-        from codetr_ros.ros import messages, qos
+        from codetr_ros.ros import qos
 
-        self.messages, self.serialise = messages, serialize_message
         self.bytes_message, self.number = UInt8MultiArray, Float64
         rclpy.init()
         self.node = rclpy.create_node(name)
@@ -178,11 +177,10 @@ class End:
             kind: self.node.create_publisher(message, f'{publishes}_{kind.__name__}', profile)
             for kind, message in self.kinds.items()
         }
-        self.inbox: list[Any] = []
-        self.raw = False
+        self.inbox: list[tuple[type, bytes]] = []
         for kind, message in self.kinds.items():
             self.node.create_subscription(
-                message, f'{receives}_{kind.__name__}', self.inbox.append, profile
+                message, f'{receives}_{kind.__name__}', self._storing(kind), profile, raw=True
             )
         self.raw_inbox: list[bytes] = []
         for kind, message in self.kinds.items():
@@ -197,21 +195,23 @@ class End:
                 raw=True,
             )
 
+    def _storing(self, kind: type) -> Callable[[bytes], None]:
+        return lambda data: self.inbox.append((kind, data))
+
     def matched(self) -> bool:
         """Whether the other end is there."""
         return all(publisher.get_subscription_count() for publisher in self.to.values())
 
     def publish(self, records: list[Record]) -> None:
         """Publish records, as a node does."""
-        stamp = self.node.get_clock().now().to_msg()
         for record in records:
-            self.to[type(record)].publish(self.messages.to_message(record, stamp))
+            self.to[type(record)].publish(encode(record, self.node.get_clock().now().nanoseconds))
 
     def receive(self, count: int) -> list[Record]:
         """Receive records, as a node does, with their own copies of the arrays."""
         self._wait(self.inbox, count)
         arrived, self.inbox[:] = list(self.inbox), []
-        return [self.messages.from_message(message) for message in arrived]
+        return [decode(kind, data) for kind, data in arrived]
 
     def receive_raw(self, count: int) -> list[bytes]:
         """Receive messages as raw bytes."""
@@ -272,7 +272,7 @@ def crossing(phases: int) -> Iterator[Row]:
             end.publish(records)
             took = float(other.stdout.readline()) - began
             raw = [
-                (end.to[type(r), 'raw'], end.serialise(end.messages.to_message(r, stamp())))
+                (end.to[type(r), 'raw'], encode(r, end.node.get_clock().now().nanoseconds))
                 for r in records
             ]
             ask('raw', len(records))
@@ -292,13 +292,6 @@ def crossing(phases: int) -> Iterator[Row]:
     finally:
         other.stdin.close()
         other.wait(DEADLINE)
-
-
-def stamp() -> Any:
-    """An empty time stamp."""
-    from builtin_interfaces.msg import Time
-
-    return Time()
 
 
 # ----------------------------------------------------------------------------------------------

@@ -94,7 +94,7 @@ def shown(value: Any) -> str:
         return str(value).lower()
     if isinstance(value, float):
         return exact(value)
-    return ' '.join(map(str, value)) if isinstance(value, tuple) else str(value)
+    return (' '.join(map(str, value)) or '[]') if isinstance(value, tuple) else str(value)
 
 
 def allowed(field: FieldInfo) -> str:
@@ -105,7 +105,7 @@ def allowed(field: FieldInfo) -> str:
     if kind is bool:
         return '`true`, `false`'
     if get_origin(kind) is tuple:
-        return '1 to 8 whole numbers'
+        return '1 to 8 whole numbers' if field.default else 'names'
     if kind is str:
         has_pattern = any(getattr(rule, 'pattern', None) for rule in field.metadata)
         return '`cpu`, `cuda`, `cuda:1`, ...' if has_pattern else 'text'

@@ -4,6 +4,7 @@ ends as if it had never come.
 
 import re
 import signal
+from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +14,8 @@ pytest.importorskip('rclpy', reason='needs ROS')
 
 from codetr_ros.config import Settings
 from codetr_ros.policy.actor import Actor, describe_network, weights_bytes
-from codetr_ros.records import CompositeReward, Policy, Record
+from codetr_ros.records import TOPICS, CompositeReward, Policy, Presence, Record
+from codetr_ros.records.roles import read_by
 from helpers.builders import policy, score, tiny, transitions
 from helpers.nodes import Nodes, Witness, domain
 from helpers.runs import finish, start, write
@@ -58,6 +60,10 @@ def bad_transitions() -> list[Record]:
     ]
 
 
+JUNK = {kind: bytes(range(7, 200)) for kind in TOPICS}
+"""What is no message at all, on each topic."""
+
+
 def bad_scores(known: CompositeReward) -> list[Record]:
     """Scores of a visitor, and of the simulator.
 
@@ -71,6 +77,7 @@ def bad_scores(known: CompositeReward) -> list[Record]:
         replace(known, **visitor, sequence=2),  # of a segment that 'sim' has scored
         known,  # the very message of before
         score(value=np.nan),
+        score(scorer='stranger'),
     ]
 
 
@@ -91,7 +98,7 @@ class Outcome:
 def outcome(tmp_path_factory):
     """A run that is held in the middle until everybody has got what an intruder sends."""
     folder = tmp_path_factory.mktemp('intruded')
-    settings = tiny()
+    settings = tiny(scorers=('visitor',))
     alone = start(write(settings, folder / 'alone'), folder / 'alone', '--in-process')
     with domain(), Nodes(settings, folder / 'run') as nodes, Witness(nodes) as witness:
         nodes.start_before(witness)
@@ -100,18 +107,24 @@ def outcome(tmp_path_factory):
         witness.say(*bad_transitions())
         witness.say(*bad_scores(witness.scores[0]))
         witness.say(policy(), of_another_architecture(settings))
+        witness.say_bytes(*JUNK.items())
 
         def refused(node, topic):
             return int(witness.counters.get(node, {}).get(f'refused {topic}', 0))
 
         witness.until(
             lambda: (
-                refused('record', 'transitions') == 5
-                and refused('reward', 'transitions') == 5
-                and refused('learner', 'transitions') == 5
-                and refused('record', 'composite_rewards') == 1
-                and refused('reward', 'composite_rewards') == 1
-                and refused('evaluate', 'policy') == 1
+                refused('record', 'transitions') == 6
+                and refused('reward', 'transitions') == 6
+                and refused('learner', 'transitions') == 6
+                and refused('record', 'composite_rewards') == 3
+                and refused('reward', 'composite_rewards') == 2
+                and refused('evaluate', 'policy') == 2
+                and all(
+                    refused(node, TOPICS[kind])
+                    for node in ('record', 'reward', 'learner', 'evaluate')
+                    for kind in (Presence, *read_by(nodes.role(node)))
+                )
             )
         )
         nodes.send(signal.SIGCONT, 'sim')
@@ -150,17 +163,24 @@ def test_wrong_transitions_are_refused_by_all_that_read_them(outcome, node, why)
     assert sum(why in said for said in outcome.refusals(node, 'transitions')) == 1
 
 
+@pytest.mark.parametrize('node', ['record', 'reward', 'learner', 'sim', 'evaluate'])
+def test_what_is_no_message_is_refused_by_all_that_read_its_topic(outcome, node):
+    for kind in (Presence, *read_by(outcome.nodes.role(node))):
+        why = f'{kind.__name__} cannot be decoded'
+        assert sum(why in said for said in outcome.refusals(node, TOPICS[kind])) == 1, kind
+
+
 def test_transitions_out_of_sequence_are_refused_by_all_that_read_them(outcome):
     assert re.search(
         r"sequence=1000000.* is out of sequence: \d+ is the next of 'sim'. What lies between "
         r"never arrived: restart 'sim'",
-        outcome.refusals('record', 'transitions')[-1],
+        outcome.refusals('record', 'transitions')[-2],
     )
     for node in ('reward', 'learner'):
         assert re.search(
             r'sequence=1000000.* is out of sequence: the permitted phases hold fewer than 400 '
             r"records, and \d+ is the next of 'sim' to be taken in",
-            outcome.refusals(node, 'transitions')[-1],
+            outcome.refusals(node, 'transitions')[-2],
         )
 
 
@@ -207,10 +227,23 @@ def test_a_phase_that_is_permitted_twice_is_refused_by_the_simulator(outcome):
 
 def test_every_refusal_is_counted_in_the_report_of_the_node(outcome):
     refused = {name: outcome.nodes.report(name)['refused'] for name in outcome.nodes.names}
-    assert refused == {
-        'sim': {'policy': 2},
-        'evaluate': {'policy': 1},
-        'reward': {'transitions': 5, 'composite_rewards': 4},
-        'learner': {'transitions': 5},
-        'record': {'transitions': 5, 'composite_rewards': 1, 'policy': 1},
+    junk = {
+        name: Counter({'presence': 1} | {TOPICS[kind]: 1 for kind in read_by(role)})
+        for name, role in ((name, outcome.nodes.role(name)) for name in outcome.nodes.names)
     }
+    # the record that a learner announces is read by all
+    assert refused == {
+        'sim': junk['sim'] + Counter({'policy': 2}),
+        'evaluate': junk['evaluate'] + Counter({'policy': 1}),
+        'reward': junk['reward'] + Counter({'transitions': 5, 'composite_rewards': 4}),
+        'learner': junk['learner'] + Counter({'transitions': 5, 'run': 1}),
+        'record': junk['record']
+        + Counter({'transitions': 5, 'composite_rewards': 2, 'policy': 1}),
+    }
+
+
+def test_the_bag_has_nothing_that_was_refused(outcome):
+    recorded = outcome.nodes.report('record')['recorded']
+    published = [outcome.nodes.report(name)['published'] for name in outcome.nodes.names]
+    for topic in ('transitions', 'policy', 'metrics', 'step_rewards', 'true_rewards', 'commits'):
+        assert recorded[topic] == sum(each.get(topic, 0) for each in published), topic

@@ -34,7 +34,7 @@ class Listener:
         }
         self.commits_of_what_is_heard = 0
         for kind in self.heard:
-            witness.link.subscribe(kind, self._store, raw=True)
+            witness.link.subscribe(kind, self._store)
 
     def _store(self, kind: type, raw: bytes) -> None:
         self.heard[kind].append(raw)

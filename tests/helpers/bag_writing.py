@@ -4,24 +4,20 @@ import os
 import subprocess
 import sys
 import textwrap
-from functools import cache
 
-from builtin_interfaces.msg import Time
 from mcap.stream_reader import StreamReader
-from rclpy.serialization import serialize_message
 
+from codetr_ros.bags.definitions import encode
 from codetr_ros.bags.topics import BagTopic
-from codetr_ros.ros import messages
 from helpers.builders import transitions
 
 TRANSITIONS = BagTopic('/r/transitions', 'codetr_msgs/msg/Transitions', 100, False)
 COMMITS = BagTopic('/r/commits', 'codetr_msgs/msg/Commit', 16, True)
 
 
-@cache  # serialised twice it may differ, in the bytes that pad it
 def raw(sequence: int, **changes) -> bytes:
     record = transitions(sequence=sequence, **changes)
-    return bytes(serialize_message(messages.to_message(record, Time(sec=sequence))))
+    return encode(record, sequence * 10**9)
 
 
 def sequences(path) -> list[int]:

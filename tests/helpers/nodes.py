@@ -17,9 +17,10 @@ from domain_coordinator import domain_id
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.signals import SignalHandlerOptions
 
+from codetr_ros.bags.definitions import decode
 from codetr_ros.config import Settings
 from codetr_ros.processes import launcher
-from codetr_ros.records import TOPICS, Commit, CompositeReward, Presence, Record
+from codetr_ros.records import TOPICS, Commit, CompositeReward, Presence, Record, RecordError
 from codetr_ros.records.roles import published_by
 from codetr_ros.ros import messages, qos
 from codetr_ros.ros.link import Link
@@ -123,6 +124,14 @@ class Nodes:
         self._processes.kill(self._processes.running())
 
 
+def sound(kind: type, data: bytes) -> list[Any]:
+    """The record in the bytes of a message; nothing if they are none."""
+    try:
+        return [decode(kind, data)]
+    except RecordError:
+        return []
+
+
 class Witness:
     """A node in the namespace of the run that is no part of it.
 
@@ -144,7 +153,7 @@ class Witness:
         )
         self.link = Link('witness')
         self.link.subscribe(Presence, self._hear)
-        self.link.subscribe(Commit, lambda _, message: self.commits.append(message))
+        self.link.subscribe(Commit, lambda kind, data: self.commits.extend(sound(kind, data)))
         self.link.subscribe(CompositeReward, self._scored)
         self.link.node.create_subscription(
             DiagnosticArray,
@@ -158,11 +167,12 @@ class Witness:
         self.link.close()
         rclpy.try_shutdown()
 
-    def _hear(self, _: type, said: Presence) -> None:
-        self.presence[said.node.rsplit('/', 1)[1]] = said
+    def _hear(self, kind: type, data: bytes) -> None:
+        for said in sound(kind, data):
+            self.presence[said.node.rsplit('/', 1)[1]] = said
 
-    def _scored(self, _: type, message: Any) -> None:
-        self.scores.append(messages.from_message(message))
+    def _scored(self, kind: type, data: bytes) -> None:
+        self.scores.extend(sound(kind, data))
 
     def _diagnosed(self, array: DiagnosticArray) -> None:
         for status in array.status:
@@ -204,8 +214,12 @@ class Witness:
 
     def say(self, *records: Record) -> None:
         """Publish records as if this were a node of the run, once all readers are matched."""
+        self.say_bytes(*((type(record), self.link.message(record)) for record in records))
+
+    def say_bytes(self, *said: tuple[type, bytes]) -> None:
+        """Publish bytes on the topics of kinds of records, once all readers are matched."""
         publishers = {}
-        for kind in dict.fromkeys(map(type, records)):
+        for kind in dict.fromkeys(kind for kind, _ in said):
             topic = TOPICS[kind]
             publishers[kind] = self.link.node.create_publisher(
                 messages.message_type(kind), topic, qos.profile(topic)
@@ -216,9 +230,8 @@ class Witness:
                 for kind, publisher in publishers.items()
             )
         )
-        now = self.link.node.get_clock().now().to_msg()
-        for record in records:
-            publishers[type(record)].publish(messages.to_message(record, now))
+        for kind, data in said:
+            publishers[kind].publish(data)
 
     def readers(self, topic: str) -> set[str]:
         """Names of the nodes that subscribe to a topic of the run."""

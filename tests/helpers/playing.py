@@ -6,6 +6,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
+from codetr_ros.bags.definitions import decode
 from codetr_ros.records import TOPICS, Presence, RunSpec
 from codetr_ros.records.roles import published_by, readers
 from codetr_ros.ros.link import Link
@@ -60,7 +61,9 @@ class Play:
                 if role in readers().get(TOPICS[kind], ()) or kind in (Presence, RunSpec):
                     link.subscribe(
                         kind,
-                        lambda kind, message, role=role: self.heard.append((role, message)),
+                        lambda kind, data, role=role: self.heard.append(
+                            (role, decode(kind, data))
+                        ),
                         settings,
                     )
         self.finished = False

@@ -12,6 +12,7 @@ from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter
 from rosbags.highlevel import AnyReader
 
+from codetr_ros.bags.definitions import decode
 from codetr_ros.records import PROTOCOL_VERSION, Commit, RunSpec
 from codetr_ros.records.roles import command
 from codetr_ros.ros.watch import Watcher
@@ -78,7 +79,8 @@ def test_a_committed_phase_is_sent_again_and_another_refused_with_the_reason(pla
 
         from codetr_ros.ros.fetch import unpack
 
-        records = {type(r).__name__: r for r in unpack(ask(run_id='run', phase=0))}
+        sent = unpack(ask(run_id='run', phase=0))
+        records = {kind.__name__: decode(kind, data) for kind, data in sent}
         assert set(records) == {'Transitions', 'CompositeReward', 'Commit'}
         again = records['Transitions'].observations
         assert again.tobytes() == transitions().observations.tobytes()

@@ -10,13 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from codetr_ros.bags.definitions import encode
+from codetr_ros.bags.definitions import decode, encode
 from codetr_ros.bags.topics import BagTopic
 from codetr_ros.bags.writer import McapWriter
 from codetr_ros.records import TOPICS, Commit, CompositeReward, RunSpec, Transitions
 from codetr_ros.records.fields import type_name
 from codetr_ros.records.roles import command
-from codetr_ros.ros import messages
 from codetr_ros.ros.link import Link
 from codetr_ros.runs import folder as run_folder
 from helpers.bags import SETTINGS, a_run, ours, topic_of
@@ -116,7 +115,7 @@ def listener(play):
     link = Link('listener')
     link.heard, link.times = [], []
     for kind in HEARD:
-        link.subscribe(kind, lambda kind, m: link.heard.append(messages.from_message(m)))
+        link.subscribe(kind, lambda kind, m: link.heard.append(decode(kind, m)))
     yield link
     link.close()
 

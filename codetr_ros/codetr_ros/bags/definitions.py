@@ -232,6 +232,16 @@ def decode(record_type: type, data: bytes | memoryview, definition: Definition =
     return record_of(record_type, values)
 
 
+def stamp_of(data: bytes) -> int:
+    """When a message was published [ns], from its CDR bytes: the first field of all our types.
+
+    Raises:
+        struct.error: the bytes are too few.
+    """
+    seconds, nanoseconds = struct.unpack_from('<iI' if data[1] & 1 else '>iI', data, 4)
+    return int(seconds * 10**9 + nanoseconds)
+
+
 def encode(record: Record, stamp: int = 0, definition: Definition = OWN) -> bytes:
     """The CDR bytes of a record's message.
 

@@ -1,6 +1,23 @@
 """What may be chosen: composite rewards and methods, and what sets some methods apart."""
 
-from typing import Literal
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from codetr_ros.config.base import in_words
+
+Scorers = tuple[
+    Annotated[
+        str,
+        Field(
+            pattern=in_words(
+                r'^[A-Za-z0-9_-]{1,64}$', '1 to 64 letters, digits, underscores and hyphens'
+            )
+        ),
+    ],
+    ...,
+]
+"""Names of scorers that are no simulators."""
 
 Composite = Literal[
     'sum',

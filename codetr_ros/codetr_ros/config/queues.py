@@ -30,12 +30,10 @@ from dataclasses import dataclass
 from math import ceil
 
 from codetr_ros.config.run import Settings
-from codetr_ros.records import MESSAGE_BYTES
+from codetr_ros.records.checks import most_parts
 
 FLOOR = 16
 MARGIN = 1.25
-HALF_A_PART = MESSAGE_BYTES // 2
-"""Bytes of a part of step rewards that are always filled."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +64,7 @@ QUALITIES: dict[str, Quality] = {
     'score_requests': Quality(True, _phases),
     'step_rewards': Quality(
         False,
-        lambda s: _phases(s) * (s.source_count + ceil(16 * s.memory_steps / HALF_A_PART)),
+        lambda s: _phases(s) * most_parts(s),
     ),
     'episodes': Quality(False, lambda s: _steps(s) + s.evaluate_episodes),
     'true_rewards': Quality(False, _steps),

@@ -14,7 +14,7 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from codetr_ros.config.base import Group, SettingsError, flatten, in_words, validate
-from codetr_ros.config.choices import SCORE_LEARNERS, Composite, Method, Scorer
+from codetr_ros.config.choices import SCORE_LEARNERS, Composite, Method, Scorer, Scorers
 from codetr_ros.config.delays import Delay, Delayed
 from codetr_ros.config.methods import (
     AggregateSettings,
@@ -85,6 +85,13 @@ class Settings(Schedule, Delayed, Scored, Threaded, Group):
         description='who scores segments: the simulator; a person on a page, who may come and go; '
         'whoever publishes on the topic (topic); or simulated people. All but the simulator score '
         'when they like and as much as they like, and the run waits for none of them',
+    )
+    scorers: Scorers = Field(
+        (),
+        max_length=64,
+        description='names of those beside the simulators whose scores are taken: a person, an '
+        'inspection; scores of anybody else are refused. Where another than the simulator scores, '
+        'no names stand for anybody',
     )
     requests: int = Field(
         8,

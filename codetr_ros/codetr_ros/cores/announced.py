@@ -16,6 +16,9 @@ from codetr_ros.records import (
 )
 from codetr_ros.records.checks import check_run, check_transitions
 
+EARLY_BYTES = 16 << 20
+"""The most bytes that are held of what comes before its source is announced."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -27,6 +30,7 @@ class Tasks:
         self._settings = settings
         self.specs: dict[str, TaskSpec] = {}
         self._unannounced: list[Transitions] = []
+        self._bytes = 0  # of their arrays
         self.refused: Counter[str] = Counter()  # steps that waited for their announcement
 
     @property
@@ -79,7 +83,7 @@ class Tasks:
             RecordError: as `receive` of this class; the steps then wait on.
         """
         self.receive(spec)
-        waiting, self._unannounced = self._unannounced, []
+        waiting, self._unannounced, self._bytes = self._unannounced, [], 0
         for chunk in waiting:
             try:
                 receive(chunk)
@@ -102,5 +106,13 @@ class Tasks:
                 f'{describe(chunk)}: {chunk.source!r} is no simulator of this run; these are: '
                 f'{", ".join(self.sources)}'
             )
+        size = chunk.observations.nbytes + chunk.actions.nbytes
+        if self._bytes + size > EARLY_BYTES:
+            raise RecordError(
+                f'{describe(chunk)} came before {chunk.source!r} was announced, and {self._bytes} '
+                f'bytes wait for that already, of at most {EARLY_BYTES}: start {chunk.source!r} '
+                'again'
+            )
+        self._bytes += size
         self._unannounced.append(chunk)  # announcements travel on another topic
         return False

@@ -29,6 +29,10 @@ class Core(Protocol[Given_co]):
         """A committed phase that is incomplete; None if there is none."""
 
     @property
+    def phase(self) -> int | None:
+        """The next phase to be finished here; None if there are none here."""
+
+    @property
     def duplicated(self) -> 'Counter[str]':
         """Counts of records that arrived again and were dropped, by topic."""
 
@@ -70,6 +74,11 @@ class Part:
     @property
     def missing(self) -> int | None:
         """A committed phase that is incomplete; None if there is none."""
+        return None
+
+    @property
+    def phase(self) -> int | None:
+        """The next phase to be finished here; None if there are none here."""
         return None
 
     def waiting_for(self) -> str:

@@ -25,6 +25,10 @@ from codetr_ros.records import (
 from codetr_ros.records.checks import check_preference, check_run, check_score
 from codetr_ros.records.numbering import Judgement
 
+HELD_BYTES = 64 << 20
+"""The least bytes of steps that may wait for their commits; more where the permitted phases have
+more."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -59,6 +63,8 @@ class Intake:
         self.duplicated: Counter[str] = Counter()
         self.refused = self.tasks.refused
         self.missing: int | None = None  # a committed phase that is incomplete
+        self._due = 0  # the next phase to be taken in
+        self._bytes = 0  # of the steps that are held
 
     def receive(self, record: Record) -> None:
         """Check a record and hold it.
@@ -71,8 +77,7 @@ class Intake:
             self.tasks.announce(record, self.receive)
         elif isinstance(record, Transitions):
             if self.tasks.admit(record):
-                key = (record.source, record.sequence)
-                self._hold(record, self._transitions, key, self._taken['transitions'])
+                self._hold_steps(record)
         elif isinstance(record, CompositeReward):
             check_score(record, self._settings.scored_at_most, self._settings.may_lack_scores)
             self._hold_judgement(record)
@@ -81,12 +86,26 @@ class Intake:
             self._hold_judgement(record)
         elif isinstance(record, TrueRewards):
             self._true[record.source, record.sequence] = record
-        elif isinstance(record, Commit):
+        elif isinstance(record, Commit) and self._due <= record.phase < self._settings.phases:
             self._commits.setdefault(record.phase, record)
 
     def _hold_judgement(self, record: Judgement) -> None:
         key = (record.scorer, record.sequence)
         self._hold(record, self._rewards, key, self._taken['scores'])
+
+    def _hold_steps(self, chunk: Transitions) -> None:
+        size = _bytes(chunk)
+        spec = self.tasks.specs[chunk.source]
+        row = 4 * (2 * spec.observation_size + spec.action_size)  # of a chunk of one step
+        most = max(HELD_BYTES, (self._settings.ahead + 1) * self._settings.phase_steps * row)
+        if self._bytes + size > most:
+            raise RecordError(
+                f'{describe(chunk)}: {self._bytes} bytes wait for their commits already, of at '
+                f'most {most}: restart the recorder, which commits'
+            )
+        key = (chunk.source, chunk.sequence)
+        if self._hold(chunk, self._transitions, key, self._taken['transitions']):
+            self._bytes += size
 
     def _hold(
         self,
@@ -94,7 +113,8 @@ class Intake:
         held: dict[tuple[str, int], Any],
         key: tuple[str, int],
         taken: 'Counter[str]',
-    ) -> None:
+    ) -> bool:
+        """Hold a record until its commit; returns whether it is new."""
         ahead = self._settings.judgements_ahead
         if key[1] >= taken[key[0]] + ahead:
             raise RecordError(
@@ -103,8 +123,9 @@ class Intake:
             )
         if key in held or key[1] < taken[key[0]]:
             self.duplicated[TOPICS[type(record)]] += 1
-        else:
-            held[key] = record
+            return False
+        held[key] = record
+        return True
 
     def take(self, phase: int, memory: Trajectories) -> bool:
         """Add all records that the phase's commit names to the memory, ordered by source and
@@ -133,6 +154,7 @@ class Intake:
         self.missing = None
         del self._commits[phase]
         for chunk in chunks:
+            self._bytes -= _bytes(chunk)
             memory.append(self._transitions.pop((chunk.source, chunk.sequence)))
         for key in true:
             memory.append_true_rewards(self._true.pop(key))
@@ -148,6 +170,7 @@ class Intake:
             for name, number in zip(names, last.tolist(), strict=True):
                 self._taken[kind][name] = number + 1
         memory.evict()
+        self._due = phase + 1
         return True
 
     def _judge(self, judgement: Judgement, memory: Trajectories, since: int, phase: int) -> None:
@@ -174,3 +197,7 @@ class Intake:
                     return None
                 named.append(held[name, sequence])
         return named
+
+
+def _bytes(chunk: Transitions) -> int:
+    return chunk.observations.nbytes + chunk.actions.nbytes

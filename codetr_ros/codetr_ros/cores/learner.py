@@ -24,7 +24,7 @@ from codetr_ros.records import (
     StepRewards,
     describe,
 )
-from codetr_ros.records.checks import check_run
+from codetr_ros.records.checks import check_labels, check_run
 from codetr_ros.records.roles import subscribed
 from codetr_ros.runs import checkpoints
 from codetr_ros.runs.checkpoints import Checkpoint
@@ -71,11 +71,7 @@ class Learner(Consumer):
                 f'{describe(record)}: {len(record.labels)} labels for segments of '
                 f'{int(record.lengths.sum())} steps'
             )
-        if not np.isfinite(record.labels).all():
-            raise RecordError(
-                f'{describe(record)}: '
-                f'labels[{int(np.argmin(np.isfinite(record.labels)))}] is not finite'
-            )
+        check_labels(record, self._settings)
         parts = self._labels.get(record.phase, {})
         others = next((part.parts for part in parts.values()), record.parts)
         if record.part >= record.parts or record.parts != others:

@@ -29,7 +29,7 @@ from codetr_ros.records import (
     describe,
     metrics,
 )
-from codetr_ros.records.checks import check_preference, check_run, check_score
+from codetr_ros.records.checks import check_preference, check_run, check_score, check_scorer
 from codetr_ros.records.numbering import Judgement, Numbering
 from codetr_ros.runs.reports import CoreReport
 
@@ -86,7 +86,7 @@ class Recorder(Part):
                     f'be committed, phase {record.phase} has {due}: stop the second learner'
                 )
             steps = dict(zip(record.sources, record.steps.tolist(), strict=True))
-            self._permitted[record.phase] = {source: n for source, n in steps.items() if n}
+            self._permit(record, {source: n for source, n in steps.items() if n})
         elif isinstance(record, Transitions):
             if self._tasks.admit(record) and self._next(record, self._transitions, record.source):
                 self._steps[record.phase, record.source] += record.steps
@@ -94,12 +94,14 @@ class Recorder(Part):
                     self._ended[record.phase, record.source] = (record.sequence, record.scores_due)
         elif isinstance(record, CompositeReward):
             check_score(record, self._settings.scored_at_most, self._settings.may_lack_scores)
+            check_scorer(record, self._settings)
             if self._settings.scored_elsewhere:
                 self._judged(record)
             else:
                 self._next(record, self._scores, record.scorer)
         elif isinstance(record, Preference):
             check_preference(record, self._settings.scored_at_most)
+            check_scorer(record, self._settings)
             if not self._settings.scored_elsewhere:
                 raise RecordError(
                     f'{describe(record)} of {record.scorer!r}: the simulator scores in this run, '
@@ -153,6 +155,17 @@ class Recorder(Part):
                     'the bag is damaged. `codetr bag verify` lists what is wrong'
                 )
         self.phase = record.phase + 1
+
+    def _permit(self, policy: Policy, members: dict[str, int]) -> None:
+        known = self._permitted.setdefault(policy.phase, members)
+        if known is members:
+            return
+        if known != members:
+            raise RecordError(
+                f'{describe(policy)} permits {members}, where {known} is permitted already: stop '
+                'the second learner'
+            )
+        self.duplicated[TOPICS[Policy]] += 1
 
     def _next(self, record: Any, due: 'Counter[str]', name: str) -> bool:
         if record.sequence > due[name]:

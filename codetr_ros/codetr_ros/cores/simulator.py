@@ -117,6 +117,11 @@ class Simulator(Part):
         acting = None if ends else acting_policy(policy, environment, self._settings)
         self._waiting[policy.phase] = policy, acting
 
+    @property
+    def phase(self) -> int:
+        """The next phase to be run."""
+        return self._phase
+
     def work(self) -> Iterator[list[Record] | None]:
         """Yield what is simulated, then per slice a chunk of each source, of at most `CHUNK_STEPS`
         steps.

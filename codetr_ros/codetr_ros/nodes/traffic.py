@@ -1,21 +1,72 @@
-"""Hands records to the core of a node, and counts its messages."""
+"""Decodes what arrives at a node, hands it to the node's core, and counts it."""
 
 import time
 from collections import Counter
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
+from codetr_ros.bags.definitions import decode
+from codetr_ros.config import Settings
 from codetr_ros.cores.core import Core, Silent
 from codetr_ros.nodes.peers import Ledger
-from codetr_ros.records import TOPICS, Commit, Record, RecordError
+from codetr_ros.records import (
+    TOPICS,
+    Commit,
+    Policy,
+    Presence,
+    Record,
+    RecordError,
+    RunSpec,
+    StepRewards,
+    Transitions,
+)
+from codetr_ros.records.bounds import check_bounds
+from codetr_ros.records.checks import check_phase
+from codetr_ros.records.shown import LONGEST_LINE, shown, worth_a_line
+
+PHASED = (Policy, Transitions, Commit, StepRewards)
+"""Kinds of records of a phase that must have been permitted."""
+LATE_COMMITS = 16
+
+
+def arrived(kind: type, data: bytes) -> Record:
+    """The record in the bytes of a message from anywhere.
+
+    Args:
+        kind: what its topic carries.
+        data: CDR.
+
+    Raises:
+        RecordError: the bytes are no such message, its lengths disagree, or a name, size or count
+            in it is beyond all bounds.
+    """
+    record = decode(kind, data)
+    check_bounds(record)
+    return record
+
+
+class Taker(Protocol):
+    """What takes records in: a core, or a part of one."""
+
+    @property
+    def duplicated(self) -> 'Counter[str]':
+        """Counts of records that arrived again and were dropped, by topic."""
+
+    def receive(self, record: Record) -> None:
+        """Take a record.
+
+        Raises:
+            RecordError: it must be refused; nothing has changed then.
+        """
 
 
 class Traffic:
-    """Hands records to the node's core and counts them, by topic.
+    """Decodes messages, hands their records to the node's core and counts them, by topic.
 
     Attributes:
         core: takes the records; a silent one until the node has joined.
-        received: records that arrived, sound or not.
+        settings: those of the run, once it is known.
+        received: messages that arrived, sound or not.
         refused: those of them that were refused.
         recovered: records that were lost, and arrived when fetched again.
         ledger: counts of the records that peers have published.
@@ -30,21 +81,49 @@ class Traffic:
         self._log = log
         self._clock = clock
         self.core: Core[Any] = Silent()
+        self.settings: Settings | None = None
         self.received: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
         self.recovered: Counter[str] = Counter()
         self.ledger = Ledger()
         self.lost_for_good: dict[str, int] | None = None
 
-    def receive(self, record: Record) -> bool:
-        """Hand a record to the core; returns whether it was new and taken."""
-        before = self.core.duplicated.total()
+    def decode(self, kind: type, data: bytes) -> Record | None:
+        """The record in a message that arrived; None if it must be refused, which is counted."""
+        if kind not in (Presence, RunSpec):  # of which nothing is missed
+            self.received[TOPICS[kind]] += 1  # sound or not, it is not lost
         try:
-            self.core.receive(record)
+            return arrived(kind, data)
         except RecordError as error:
-            self.refuse(type(record), error)
+            self.refuse(TOPICS[kind], error)
+            return None
+
+    def receive(self, record: Record, taker: Taker | None = None) -> bool:
+        """Hand a record to the core, or to another taker; returns whether it was new and taken."""
+        taker = self.core if taker is None else taker
+        before = taker.duplicated.total()
+        try:
+            self._check_phase(record)
+            taker.receive(record)
+        except RecordError as error:
+            self.refuse(TOPICS[type(record)], error)
             return False
-        return self.core.duplicated.total() == before
+        return taker.duplicated.total() == before
+
+    def _check_phase(self, record: Record) -> None:
+        due, settings = self.core.phase, self.settings
+        if due is None or settings is None or not isinstance(record, PHASED):
+            return
+        # so many commits reach a node that was started again and takes in earlier phases
+        late = LATE_COMMITS if isinstance(record, Commit) else 0
+        check_phase(record, due + late, settings)
+
+    def take_again(self, kind: type, data: bytes) -> None:
+        """Take the bytes of a message that was fetched again."""
+        try:
+            self.receive_again(arrived(kind, data))
+        except RecordError as error:
+            self.refuse(TOPICS[kind], error)
 
     def receive_again(self, record: Record) -> None:
         """Hand over a record that was fetched again; one that is new was lost before."""
@@ -52,13 +131,13 @@ class Traffic:
         if self.receive(record) and not isinstance(record, Commit):
             self.recovered[TOPICS[type(record)]] += 1
 
-    def refuse(self, kind: type, error: RecordError) -> None:
+    def refuse(self, topic: str, error: RecordError) -> None:
         """Count a refusal; log the first ten on a topic, then every thousandth."""
-        topic = TOPICS[kind]
         self.refused[topic] += 1
         n = self.refused[topic]
-        if n <= 10 or n % 1000 == 0:
-            self._log.error(f'refused on {topic!r} (number {n}): {error}')
+        if worth_a_line(n):
+            reason = shown(str(error), LONGEST_LINE)
+            self._log.error(f'refused on {topic!r} (number {n}): {reason}')
 
     def lost(self) -> dict[str, int]:
         """Counts of the records that peers published a while ago, according to their presence,

@@ -1,18 +1,64 @@
 """Checks of a record before any part of a run takes it."""
 
+from math import ceil
+from typing import Protocol
+
 import numpy as np
 
 from codetr_ros.records import (
+    MESSAGE_BYTES,
     OUTCOMES,
+    Commit,
     CompositeReward,
+    Policy,
     Preference,
     Record,
     RecordError,
     RunSpec,
+    StepRewards,
     TaskSpec,
     Transitions,
     describe,
 )
+
+
+class LabelSettings(Protocol):
+    """The settings of a run that decide how many labels there are."""
+
+    @property
+    def memory_steps(self) -> int:
+        """Steps that the memory D holds."""
+
+    @property
+    def source_count(self) -> int:
+        """Number of sources of the run."""
+
+
+class PhaseSettings(Protocol):
+    """The settings of a run that decide which phases there are."""
+
+    @property
+    def ahead(self) -> int:
+        """Phases by which a source may be ahead of the newest that was learnt from."""
+
+    @property
+    def phases(self) -> int:
+        """Phases of the run."""
+
+
+class ScoreSettings(Protocol):
+    """The settings of a run that decide whose scores are taken."""
+
+    @property
+    def scorers(self) -> tuple[str, ...]:
+        """Names of those beside the simulators whose scores are taken."""
+
+    @property
+    def scored_elsewhere(self) -> bool:
+        """Whether another than the simulator scores."""
+
+
+PhaseRecord = Policy | Transitions | Commit | StepRewards
 
 
 def check_run(record: Record, run: RunSpec) -> None:
@@ -57,6 +103,74 @@ def check_transitions(chunk: Transitions, spec: TaskSpec) -> None:
             f'{spec.horizon} of {spec.task}'
         )
 
+
+def check_labels(record: StepRewards, settings: LabelSettings) -> None:
+    """Refuse labels that cannot be those of a phase.
+
+    Raises:
+        RecordError: names the field, its value and what is allowed.
+    """
+    if not np.isfinite(record.labels).all():
+        raise RecordError(
+            f'{describe(record)}: '
+            f'labels[{int(np.argmin(np.isfinite(record.labels)))}] is not finite'
+        )
+    if len(record.lengths) and not int(record.lengths.min()):
+        raise RecordError(f'{describe(record)}: a length is 0: a segment has steps')
+    most = most_parts(settings)
+    if not record.part < record.parts <= most:
+        raise RecordError(
+            f'{describe(record)}: part {record.part} of {record.parts}: the labels of a phase '
+            f'have 1 to {most} parts, numbered from 0'
+        )
+
+
+def check_scorer(judgement: CompositeReward | Preference, settings: ScoreSettings) -> None:
+    """Refuse a judgement of somebody who is not asked for any.
+
+    Raises:
+        RecordError: names the scorer, and the setting that admits it.
+    """
+    scorer = judgement.scorer
+    if scorer in settings.scorers or (settings.scored_elsewhere and not settings.scorers):
+        return
+    if not settings.scored_elsewhere and scorer == judgement.source:
+        return
+    raise RecordError(
+        f'{describe(judgement)} is by {scorer!r}, who is no scorer of this run: start the run '
+        f'with scorers={[*settings.scorers, scorer]}'
+    )
+
+
+def check_phase(record: PhaseRecord, due: int, settings: PhaseSettings) -> None:
+    """Refuse a record of a phase that nobody has permitted yet.
+
+    Args:
+        record: the record.
+        due: the next phase to be finished here. The phases before it are permitted, and so many
+            more as a source may be ahead.
+        settings: the settings of the run.
+
+    Raises:
+        RecordError: names the phase and the last that may be under way.
+    """
+    last = min(due + settings.ahead, settings.phases + settings.ahead - 1)
+    if record.phase > last:
+        raise RecordError(
+            f'{describe(record)}: phase {record.phase} cannot have begun: {due} is the next to be '
+            f'finished, so that {last} is the last that may be permitted'
+        )
+
+
+def most_parts(settings: LabelSettings) -> int:
+    """The most parts in which the labels of a phase travel: at most 4 bytes for each label and 12
+    for its segment, in parts of which all but the last of each source are half full at least.
+    """
+    return settings.source_count + ceil(16 * settings.memory_steps / HALF_A_PART)
+
+
+HALF_A_PART = MESSAGE_BYTES // 2
+"""Bytes of a part of step rewards that are always filled."""
 
 LARGEST_SCORE = 1e100
 """The largest amount of a composite reward: squares of larger ones have no float64 any more."""

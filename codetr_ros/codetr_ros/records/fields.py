@@ -20,6 +20,7 @@ from codetr_ros.records import (
     Transitions,
     TrueRewards,
 )
+from codetr_ros.records.shown import shown
 
 PACKAGE = 'codetr_msgs'
 
@@ -66,6 +67,7 @@ def record_of(record_type: type, values: dict[str, Any]) -> Record:
 
 def _refuse(record_type: type, values: dict[str, Any], field: str, expected: str) -> RecordError:
     sender = values.get('source') or values.get('node') or values.get('role') or 'its publisher'
+    sender = shown(sender)
     numbers = ', '.join(
         f'{name}={values[name]}' for name in ('sequence', 'phase', 'part') if name in values
     )

@@ -1,24 +1,24 @@
 """Fetches a committed phase again from the recorder, for a node that lacks some of it."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from codetr_msgs.srv import FetchPhase
-from rclpy.serialization import deserialize_message
 
 from codetr_ros.nodes.fetching import Fetching
-from codetr_ros.records import Record, RecordError
+from codetr_ros.nodes.traffic import Traffic
+from codetr_ros.records import RecordError
 from codetr_ros.records.fields import RECORD_TYPES
-from codetr_ros.ros import messages
+from codetr_ros.records.shown import shown
 from codetr_ros.ros.link import Link
 
 SERVICE = 'fetch_phase'
 
 
-def unpack(response: Any) -> list[Record]:
-    """The records of a response.
+def unpack(response: Any) -> Iterator[tuple[type, bytes]]:
+    """Kind and bytes of each message in a response.
 
     Raises:
         RecordError: lengths disagree, or a type is no record.
@@ -30,16 +30,13 @@ def unpack(response: Any) -> list[Record]:
             f'bytes and {len(response.cdr)} bytes disagree: update the recorder'
         )
     data = bytes(response.cdr)
-    records = []
     ends = np.cumsum(lengths, dtype=np.int64)
     for kind, length, end in zip(response.types, lengths, ends.tolist(), strict=True):
         if kind not in RECORD_TYPES:
-            raise RecordError(f'{SERVICE}: {kind!r} is not a type of record: update the recorder')
-        message_type = messages.message_type(RECORD_TYPES[kind])
-        records.append(
-            messages.from_message(deserialize_message(data[end - length : end], message_type))
-        )
-    return records
+            raise RecordError(
+                f'{SERVICE}: {shown(repr(kind))} is not a type of record: update the recorder'
+            )
+        yield RECORD_TYPES[kind], data[end - length : end]
 
 
 class Fetcher:
@@ -48,16 +45,15 @@ class Fetcher:
     Args:
         link: the node's connection.
         run_id: the run.
-        receive: takes each record that arrives.
+        traffic: takes each message that arrives.
     """
 
-    def __init__(self, link: Link, run_id: str, receive: Callable[[Record], None]) -> None:
+    def __init__(self, link: Link, run_id: str, traffic: Traffic) -> None:
         self._link = link
         self._run_id = run_id
-        self._receive = receive
+        self._traffic = traffic
         self._client = link.node.create_client(FetchPhase, SERVICE)
         self._fetching = Fetching()
-        self.fetched = 0
 
     def check(self, missing: int | None) -> None:
         """Ask for a phase that has been incomplete for a while.
@@ -84,14 +80,14 @@ class Fetcher:
         response = done.result()
         log = self._link.node.get_logger()
         if not response.found:
-            log.error(f'the recorder does not send phase {phase} again: {response.reason}')
+            reason = shown(response.reason)
+            log.error(f'the recorder does not send phase {phase} again: {reason}')
             return
+        came = 0
         try:
-            records = unpack(response)
+            for kind, data in unpack(response):
+                came += 1
+                self._traffic.take_again(kind, data)
         except RecordError as error:
-            log.error(str(error))
-            return
-        for record in records:
-            self._receive(record)
-        self.fetched += len(records)
-        log.info(f'phase {phase}: {len(records)} messages came again')
+            self._traffic.refuse(SERVICE, error)
+        log.info(f'phase {phase}: {came} messages came again')

@@ -167,7 +167,7 @@ def join(
         run_folder.write_settings(folder, settings)
     checkpoints = folder / run_folder.CHECKPOINTS if folder else None
     core = make_core(run, settings, link.name, checkpoints, **member.core_values)
-    member.serve(core)
+    member.serve(core, settings)
     return Joined(run, settings, core, folder)
 
 

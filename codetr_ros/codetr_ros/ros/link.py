@@ -13,13 +13,21 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.duration import Duration
 from rclpy.experimental import EventsExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
+from codetr_ros.bags.definitions import encode
 from codetr_ros.config import Settings
 from codetr_ros.records import TOPICS, Record
+from codetr_ros.records.shown import shown, worth_a_line
 from codetr_ros.ros import messages, qos
 from codetr_ros.ros.plots import Plots
+
+UNDECODABLE = (rclpy_implementation.RCLError, rclpy_implementation.RMWError, UnicodeDecodeError)
+"""What the executor raises for a request, or an answer, that is none. Callbacks of ours only store
+what arrived, and raise nothing.
+"""
 
 RECORDS_OF_TOPIC = {topic: record_type for record_type, topic in TOPICS.items()}
 
@@ -41,6 +49,7 @@ class Link:
         self._events = 0
         self.inbox: deque[Callable[[], None]] = deque()
         self.published: Counter[str] = Counter()
+        self.undecodable = 0  # requests and answers of services
 
     @property
     def full_name(self) -> str:
@@ -69,27 +78,28 @@ class Link:
     def subscribe(
         self,
         record_type: type,
-        handle: Callable[..., None],
+        handle: Callable[[type, bytes], None],
         settings: Settings | None = None,
-        raw: bool = False,
     ) -> None:
-        """Let the main loop call `handle(record_type, message)` for each message on the topic of a
+        """Let the main loop call `handle(record_type, data)` for each message on the topic of a
         kind of record.
+
+        The middleware decodes nothing: in its callbacks, bytes that are no message would end the
+        node.
 
         Args:
             record_type: the kind of record.
-            handle: gets the message, or its bytes if `raw`.
+            handle: gets the bytes of each message as they came.
             settings: the settings of the run, for the depth of the queue.
-            raw: hand over the serialised bytes as they came.
         """
         topic = TOPICS[record_type]
         self.node.create_subscription(
             messages.message_type(record_type),
             topic,
             # no message info: the events executor of this version fails on callbacks that take it
-            lambda message: self.store(handle, record_type, message),
+            lambda data: self.store(handle, record_type, data),
             qos.profile(topic, settings),
-            raw=raw,
+            raw=True,
         )
 
     def advertise(self, topics: Iterable[str], settings: Settings | None = None) -> None:
@@ -106,13 +116,13 @@ class Link:
         self.send(TOPICS[type(record)], self.message(record))
         self._plots.publish(record)
 
-    def message(self, record: Record) -> Any:
-        """The message of a record, stamped with the present time."""
-        return messages.to_message(record, self.node.get_clock().now().to_msg())
+    def message(self, record: Record) -> bytes:
+        """The bytes of a record's message, stamped with the present time."""
+        return encode(record, self.node.get_clock().now().nanoseconds)
 
-    def send(self, topic: str, message: Any) -> None:
-        """Publish a message, or its CDR bytes, and count it."""
-        self._publishers[topic].publish(message)
+    def send(self, topic: str, data: bytes) -> None:
+        """Publish the bytes of a message, and count it."""
+        self._publishers[topic].publish(data)
         self.published[topic] += 1
 
     def diagnose(self, level: bytes, message: str, counters: dict[str, dict[str, int]]) -> None:
@@ -140,13 +150,21 @@ class Link:
         Args:
             wait: seconds to block for something to arrive, if nothing has.
         """
-        if wait:
-            self._executor.spin_once(timeout_sec=wait)
-        while True:
-            seen = self._events
-            self._executor.spin_once(timeout_sec=0)
-            if self._events == seen:
-                return
+        try:
+            if wait:
+                self._executor.spin_once(timeout_sec=wait)
+            while True:
+                seen = self._events
+                self._executor.spin_once(timeout_sec=0)
+                if self._events == seen:
+                    return
+        except UNDECODABLE as error:
+            self.undecodable += 1
+            if worth_a_line(self.undecodable):
+                self.node.get_logger().error(
+                    f'undecodable message to a service (number {self.undecodable}): '
+                    f'{shown(str(error))}'
+                )
 
     def handle(self, wait: float = 0.0) -> None:
         """Handle everything that has arrived, in the main loop.

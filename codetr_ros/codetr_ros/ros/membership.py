@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from codetr_ros.config import Settings, SettingsError, from_canonical
 from codetr_ros.cores.core import Core
 from codetr_ros.nodes.errors import NodeError
 from codetr_ros.nodes.patience import Limit, Patience
@@ -24,7 +25,7 @@ from codetr_ros.records import (
     describe,
 )
 from codetr_ros.records.roles import published_by
-from codetr_ros.ros import given, link, messages, parameters
+from codetr_ros.ros import given, link, parameters
 from codetr_ros.ros.fetch import Fetcher
 from codetr_ros.ros.link import Link
 from codetr_ros.ros.signals import Stop
@@ -48,7 +49,7 @@ class Membership:
         company: members in the same process, which take their turns with this one.
         values: the node's own parameters, once they are declared.
         run: the run, once it is known.
-        announcement: the message that announced the run; None in the node that made it.
+        announcement: the bytes that announced the run; none in the node that made it.
         begun: whether all peers have been present; from then on, a conflict with another node or
             run is logged and ends no node.
         doing: what the node does now, for people.
@@ -83,7 +84,7 @@ class Membership:
         self.company: list[Membership] = []
         self.values: dict[str, Any] = {}
         self.run: RunSpec | None = None
-        self.announcement: Any = None
+        self.announcement = b''
         self.begun = False
         self.doing = 'starting'
         self.deadline_is, self.again = Limit.setting, Limit.again
@@ -155,12 +156,17 @@ class Membership:
                     f'{self.link.full_name}: parameter {name} = {value!r}: {error}'
                 ) from None
 
-    def serve(self, core: Core[Any]) -> None:
-        """Hand records to a core from now on, and fetch again those that it lacks."""
-        self.traffic.core = core
+    def serve(self, core: Core[Any], settings: Settings | None = None) -> None:
+        """Hand records to a core from now on, and fetch again those that it lacks.
+
+        Args:
+            core: the node's.
+            settings: those of the run, which bound what is handed over.
+        """
+        self.traffic.core, self.traffic.settings = core, settings
         self._serves = True
         if self.run is not None and Commit in core.subscribes:
-            self._fetcher = Fetcher(self.link, self.run.run_id, self.traffic.receive_again)
+            self._fetcher = Fetcher(self.link, self.run.run_id, self.traffic)
 
     def turn(self, wait: float = 0.0) -> None:
         """Give ROS its turn: take what arrived, and publish the presence when it is due.
@@ -178,26 +184,31 @@ class Membership:
 
     # ---- records
 
-    def take(self, kind: type, message: Any) -> None:
-        """Take a message of any kind that arrived."""
-        if kind not in (Presence, RunSpec):
-            self.traffic.received[TOPICS[kind]] += 1  # sound or not, it is not lost
+    def take(self, kind: type, data: bytes) -> None:
+        """Take the bytes of a message of any kind that arrived."""
+        record = self.traffic.decode(kind, data)
+        if record is None:
+            return
         try:
-            record = messages.from_message(message)
             if isinstance(record, Presence):
                 self._note_peer(record)
             elif isinstance(record, RunSpec):
-                self._note_run(record, message)
+                self._note_run(record, data)
             else:
                 self.traffic.receive(record)
         except RecordError as error:
-            self.traffic.refuse(kind, error)
+            self.traffic.refuse(TOPICS[kind], error)
 
     # ---- runs and peers
 
-    def _note_run(self, spec: RunSpec, message: Any) -> None:
+    def _note_run(self, spec: RunSpec, data: bytes) -> None:
         own = self.run
         if own is not None and spec.run_id == own.run_id:
+            if (spec.settings_hash, spec.seed) != (own.settings_hash, own.seed):
+                raise RecordError(
+                    f'run {spec.run_id!r} is announced again with other settings: stop the second '
+                    'learner'
+                )
             return
         if spec.protocol_version != PROTOCOL_VERSION:
             raise RecordError(
@@ -225,8 +236,12 @@ class Membership:
                 f'(parameter run_id = {self.values["run_id"]!r}): leave run_id out, or start '
                 'that learner'
             )
+        try:
+            from_canonical(spec.settings, f'run {spec.run_id!r}')
+        except SettingsError as error:
+            raise RecordError(str(error)) from None
         self.traffic.received['run'] += 1
-        self.run, self.announcement = spec, message
+        self.run, self.announcement = spec, data
 
     def _note_peer(self, presence: Presence) -> None:
         if presence.instance_id == self._instance:

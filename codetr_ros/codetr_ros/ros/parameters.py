@@ -193,7 +193,9 @@ def descriptor(name: str, value: Any = None) -> ParameterDescriptor:
         shown.type = Type.STRING.value
         constraints.append('one of: ' + ', '.join(typing.get_args(kind)))
     elif typing.get_origin(kind) is tuple:
-        shown.type = Type.INTEGER_ARRAY.value
+        element, _ = _plain(typing.get_args(kind)[0])
+        of_text = typing.get_args(element)[0] is str
+        shown.type = (Type.STRING_ARRAY if of_text else Type.INTEGER_ARRAY).value
     elif kind is bool:
         shown.type = Type.BOOL.value
     elif kind is int:

@@ -45,7 +45,7 @@ class PlayedWiring(Wiring):
         settings = self.joined.settings
         for kind in _must_read(self.member.role, settings, self._live):
             if kind not in self.joined.core.subscribes:
-                self.member.link.subscribe(kind, self._pass, settings, raw=True)
+                self.member.link.subscribe(kind, self._pass, settings)
 
     def _pass(self, kind: type, raw: bytes) -> None:
         self.member.traffic.received[TOPICS[kind]] += 1

@@ -16,7 +16,6 @@ from dataclasses import replace
 from typing import Any, cast
 
 import rclpy
-from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
 
 from codetr_ros.bags.playback import Item, Pace, Playback, RecordedRun
@@ -152,7 +151,7 @@ class Playing(PlayedWiring):
         topic, data = TOPICS[type(record)], given.data
         if record.run_id != self.joined.run.run_id:
             record = replace(record, run_id=self.joined.run.run_id)
-            data = serialize_message(link.message(record))
+            data = link.message(record)
         if isinstance(record, Commit):
             self._last.commit(record, data)
             self._log_phase(record)

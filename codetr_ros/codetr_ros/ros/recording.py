@@ -1,27 +1,35 @@
 """The recorder's wiring: writes messages as they arrive, and commits phases.
 
-Every message of the run is appended to the bag as received bytes before the core sees it, sound or
-not. A commit goes into the bag after all records that it names, and out to the nodes only after
-the bag is flushed and synced. So nobody learns from what could be lost, and the bag names the
-records of every phase that anybody has learnt from. Messages of another run are refused and not
-recorded. The last phases stay in memory too: the service `fetch_phase` sends one of them again.
+Every message that is admitted goes into the bag as received bytes; what is refused does not, or a
+bag could hold what nobody has learnt from. A commit goes into the bag after all records that it
+names, and out to the nodes only after the bag is flushed and synced. So nobody learns from what
+could be lost, and the bag names the records of every phase that anybody has learnt from. The last
+phases stay in memory too: the service `fetch_phase` sends one of them again.
 """
 
 import time
 from collections import Counter, deque
 from pathlib import Path
-from typing import Any
+from typing import cast
 
-from rclpy.serialization import deserialize_message, serialize_message
-
+from codetr_ros.bags.definitions import encode, stamp_of
 from codetr_ros.bags.first_labels import FirstLabels
 from codetr_ros.bags.topics import topics_of_run
 from codetr_ros.bags.writer import McapWriter
+from codetr_ros.cores.beside import Beside, Early
+from codetr_ros.cores.recorder import Recorder
 from codetr_ros.nodes.settling import Settling, still_missing
-from codetr_ros.records import TOPICS, Commit, Presence, Record, RecordError, RunSpec, StepRewards
-from codetr_ros.records.checks import check_run
+from codetr_ros.records import (
+    TOPICS,
+    Commit,
+    Presence,
+    Record,
+    RecordError,
+    RunSpec,
+    StepRewards,
+    TaskSpec,
+)
 from codetr_ros.records.roles import published_by
-from codetr_ros.ros import messages
 from codetr_ros.ros.joining import Joined
 from codetr_ros.ros.membership import Membership
 from codetr_ros.ros.resend import Resender
@@ -44,6 +52,9 @@ class Recording(Wiring):
         kinds = [kind for kind in TOPICS if kind not in NOT_RECORDED]
         self._full = {kind: node.resolve_topic_name(TOPICS[kind]) for kind in kinds}
         self._first = FirstLabels(settings) if settings.record_relabels == 'first' else None
+        core = cast(Recorder, joined.core)
+        self._beside = Beside(joined.run, settings, lambda: core.phase)
+        self._early = Early(settings)
         self._bag: McapWriter | None = None
         self._recorded: Counter[str] = Counter()
         self._settling = Settling(member.link.full_name, member.peers, member.limit)
@@ -62,10 +73,10 @@ class Recording(Wiring):
                 keep_free=round(self.member.values['bag_keep_free_mb'] * 1e6),
             )
             self.log.info(f'records to {folder}')
-        self._write(RunSpec, serialize_message(self.member.announcement))
+        self._write(RunSpec, self.member.announcement)
         for kind in self._full:
             if kind not in (RunSpec, Commit):  # the first has arrived, the second is our own
-                link.subscribe(kind, self.take, settings, raw=True)
+                link.subscribe(kind, self.take, settings)
         self._last = Resender(link, self.joined.run.run_id, settings.ahead + 2)
 
     def _bag_folder(self) -> Path | None:
@@ -74,32 +85,37 @@ class Recording(Wiring):
         return self.joined.folder and self.joined.folder / run_folder.BAG
 
     def take(self, kind: type, raw: bytes) -> None:
-        """Write the bytes of a message as they came, and hand the record to the core."""
-        self.member.traffic.received[TOPICS[kind]] += 1
+        """Take the bytes of a message: what is admitted is written as it came."""
+        record = self.member.traffic.decode(kind, raw)
         if self._bag is not None and self._bag.closed:
             return  # stopped, while others may still publish
-        message = deserialize_message(raw, messages.message_type(kind))
-        published = message.stamp.sec * 10**9 + message.stamp.nanosec
-        try:
-            record = messages.from_message(message)
-            check_run(record, self.joined.run)
-        except RecordError as error:
-            if message.run_id == self.joined.run.run_id:
-                self._write(kind, raw, published)  # the bag holds what arrived, sound or not
-            self.member.traffic.refuse(kind, error)
-            return
-        self._write(kind, self._kept(record, raw, message), published)
-        if kind in self.joined.core.subscribes and self.member.traffic.receive(record):
-            self._last.hold(record, raw)
+        if record is not None:
+            self._take(record, raw)
 
-    def _kept(self, record: Record, raw: bytes, message: Any) -> bytes:
+    def _take(self, record: Record, raw: bytes) -> None:
+        traffic = self.member.traffic
+        try:
+            if self._early.holds(record, raw):
+                return
+        except RecordError as error:
+            traffic.refuse(TOPICS[type(record)], error)
+            return
+        core = self.joined.core
+        learnt_from = type(record) in core.subscribes
+        if not traffic.receive(record, None if learnt_from else self._beside):
+            return
+        self._write(type(record), self._kept(record, raw), stamp_of(raw))
+        self._last.hold(record, raw)
+        if isinstance(record, TaskSpec):
+            for waiting, data in self._early.announced(record.source):
+                self._take(waiting, data)
+
+    def _kept(self, record: Record, raw: bytes) -> bytes:
         """The bytes that the bag keeps of a message: all, or only the first labels if so set."""
         if self._first is None or not isinstance(record, StepRewards):
             return raw
         kept = self._first.keep(record)
-        if kept is None:
-            return raw
-        return bytes(serialize_message(messages.to_message(kept, message.stamp)))
+        return raw if kept is None else encode(kept, stamp_of(raw))
 
     def _write(self, kind: type, raw: bytes, published: int | None = None) -> None:
         now = self.member.link.node.get_clock().now().nanoseconds
@@ -115,8 +131,7 @@ class Recording(Wiring):
             return
         if self._bag is not None:
             self._bag.check_room()
-        message = link.message(given)
-        raw = serialize_message(message)
+        raw = link.message(given)
         self._write(Commit, raw)
         if self._bag is not None:
             began = time.perf_counter()
@@ -126,7 +141,7 @@ class Recording(Wiring):
             self._flush_seconds += seconds
             self._longest_flush = max(self._longest_flush, seconds)
         self._last.commit(given, raw)
-        link.send(TOPICS[Commit], message)
+        link.send(TOPICS[Commit], raw)
 
     def settled(self, seconds: float) -> bool:
         """Whether all nodes have finished and all their records are in the bag.

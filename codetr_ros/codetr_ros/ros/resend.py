@@ -4,6 +4,7 @@ from codetr_msgs.srv import FetchPhase
 
 from codetr_ros.nodes.last_phases import LastPhases
 from codetr_ros.records.fields import type_name
+from codetr_ros.records.shown import shown
 from codetr_ros.ros.fetch import SERVICE
 from codetr_ros.ros.link import Link
 
@@ -27,9 +28,9 @@ class Resender(LastPhases):
         self, request: FetchPhase.Request, response: FetchPhase.Response
     ) -> FetchPhase.Response:
         if request.run_id != self._run_id:
+            other = shown(repr(request.run_id))
             response.reason = (
-                f'this recorder is of run {self._run_id!r}, not {request.run_id!r}: ask that of '
-                'your run'
+                f'this recorder is of run {self._run_id!r}, not {other}: ask that of your run'
             )
             return response
         try:
@@ -38,7 +39,8 @@ class Resender(LastPhases):
             response.reason = str(error.args[0])
             return response
         self._log.warning(
-            f'{request.requester} lacks something of phase {request.phase}: sending it again'
+            f'{shown(request.requester)} lacks something of phase {request.phase}: sending it '
+            'again'
         )
         response.found = True
         response.types = [type_name(kind) for kind, _ in phase]

@@ -3,8 +3,8 @@ commits of a namespace.
 """
 
 from collections.abc import Callable
+from functools import partial
 from types import TracebackType
-from typing import Any
 
 import rclpy
 from rclpy.context import Context
@@ -26,6 +26,8 @@ from codetr_ros.records import (
     TaskSpec,
 )
 from codetr_ros.ros import messages, qos
+from codetr_ros.ros.link import UNDECODABLE
+from codetr_ros.ros.traffic import arrived
 
 WATCHED = (RunSpec, Presence, TaskSpec, Commit, EpisodeResult, Metrics)
 """Records that show how a run is going; the data themselves are left alone."""
@@ -50,7 +52,7 @@ class Watcher:
         self._on_record = on_record
         self._namespace = namespace
         self._name = name
-        self._inbox: list[Any] = []
+        self._inbox: list[tuple[type, bytes]] = []
         self._events = 0
         self.refused = 0
 
@@ -70,7 +72,7 @@ class Watcher:
             self._node.create_subscription(
                 messages.message_type(kind),
                 TOPICS[kind],
-                self._store,
+                partial(self._store, kind),
                 QoSProfile(
                     depth=DEPTH,
                     reliability=ReliabilityPolicy.RELIABLE,
@@ -78,12 +80,13 @@ class Watcher:
                     if durable
                     else DurabilityPolicy.VOLATILE,
                 ),
+                raw=True,
             )
         return self
 
-    def _store(self, message: Any) -> None:
+    def _store(self, kind: type, data: bytes) -> None:
         self._events += 1
-        self._inbox.append(message)
+        self._inbox.append((kind, data))
 
     def poll(self, timeout: float) -> int:
         """Wait at most `timeout` seconds until something arrives, and hand over all that has.
@@ -100,15 +103,17 @@ class Watcher:
                     break
         except ExternalShutdownException:
             return 0
-        arrived, self._inbox = self._inbox, []
-        for message in arrived:
+        except UNDECODABLE:
+            self.refused += 1
+        came, self._inbox = self._inbox, []
+        for kind, data in came:
             try:
-                record = messages.from_message(message)
+                record = arrived(kind, data)
             except RecordError:
                 self.refused += 1
                 continue
             self._on_record(record)
-        return len(arrived)
+        return len(came)
 
     def __exit__(
         self,

@@ -1,0 +1,137 @@
+"""What a recorder checks beyond its core: records that no commit names, and those that come before
+their source is announced.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+
+from codetr_ros.config import Settings
+from codetr_ros.cores.announced import EARLY_BYTES
+from codetr_ros.records import (
+    TOPICS,
+    CompositeReward,
+    EpisodeResult,
+    Metrics,
+    Record,
+    RecordError,
+    RunSpec,
+    StepRewards,
+    Transitions,
+    TrueRewards,
+    describe,
+)
+from codetr_ros.records.checks import check_labels, check_run
+
+
+class Early:
+    """Holds records until their source is announced: topics overtake each other.
+
+    Args:
+        settings: the settings of the run.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._sources = settings.source_count
+        self._announced: set[str] = set()
+        self._held: list[tuple[Record, bytes]] = []
+        self._bytes = 0
+
+    def holds(self, record: Record, data: bytes) -> bool:
+        """Hold a record if its source may still be announced; returns whether it is held.
+
+        Raises:
+            RecordError: too much is held already.
+        """
+        if not isinstance(record, (Transitions, CompositeReward, TrueRewards)):
+            return False
+        if record.source in self._announced or len(self._announced) >= self._sources:
+            return False
+        if self._bytes + len(data) > EARLY_BYTES:
+            raise RecordError(
+                f'{describe(record)} came before {record.source!r} was announced, and '
+                f'{self._bytes} bytes wait for that already, of at most {EARLY_BYTES}: start '
+                f'{record.source!r} again'
+            )
+        self._held.append((record, data))
+        self._bytes += len(data)
+        return True
+
+    def announced(self, source: str) -> list[tuple[Record, bytes]]:
+        """Note that a source is announced; what waited for that, and no longer needs to."""
+        self._announced.add(source)
+        waiting, self._held, self._bytes = self._held, [], 0
+        return waiting
+
+
+class Beside:
+    """Checks the records that go into a bag and that no commit names.
+
+    Args:
+        run: the run.
+        settings: its settings.
+        committed: returns the next phase to be committed.
+
+    Attributes:
+        duplicated: counts of records that arrived again, by topic.
+    """
+
+    def __init__(self, run: RunSpec, settings: Settings, committed: Callable[[], int]) -> None:
+        self._run = run
+        self._settings = settings
+        self._committed = committed
+        self._parts: tuple[int, int] = (-1, 0)  # phase of the newest labels, and parts of it
+        self._seen: set[int] = set()  # of these parts
+        self._due: Counter[str] = Counter()  # next sequence number of true rewards, by source
+        self.duplicated: Counter[str] = Counter()
+
+    def receive(self, record: Record) -> None:
+        """Check a record.
+
+        Raises:
+            RecordError: it must be refused; nothing has changed then.
+        """
+        check_run(record, self._run)
+        if isinstance(record, StepRewards):
+            self._labels(record)
+        elif isinstance(record, TrueRewards):
+            self._true_rewards(record)
+        elif isinstance(record, EpisodeResult):
+            self._within(record, record.version, -1, self._settings.phases - 1, 'version')
+            self._within(record, record.step, 0, self._settings.steps, 'step')
+        elif isinstance(record, Metrics):
+            self._within(record, record.phase, -1, self._settings.phases - 1, 'phase')
+            self._within(record, record.step, 0, self._settings.steps, 'step')
+
+    def _within(self, record: Record, value: int, least: int, most: int, name: str) -> None:
+        if not least <= value <= most:
+            raise RecordError(
+                f'{describe(record)}: {name} must be from {least} to {most} in this run'
+            )
+
+    def _labels(self, record: StepRewards) -> None:
+        check_labels(record, self._settings)
+        self._within(record, record.phase, 0, self._committed() - 1, 'phase')
+        phase, parts = self._parts
+        if record.phase < phase or (record.phase == phase and record.part in self._seen):
+            self.duplicated[TOPICS[StepRewards]] += 1
+            return
+        if record.phase == phase and record.parts != parts:
+            raise RecordError(
+                f'{describe(record)}: others of the phase are of {parts} parts: two reward nodes? '
+                'Stop one of them'
+            )
+        if record.phase > phase:
+            self._parts, self._seen = (record.phase, record.parts), set()
+        self._seen.add(record.part)
+
+    def _true_rewards(self, record: TrueRewards) -> None:
+        settings, due = self._settings, self._due[record.source]
+        first = self._committed()
+        self._within(record, record.phase, first - 1, first + settings.ahead, 'phase')
+        self._within(record, len(record.rewards), 1, settings.phase_steps, 'length of rewards')
+        if record.sequence < due:
+            self.duplicated[TOPICS[TrueRewards]] += 1
+            return
+        most = due + (settings.ahead + 1) * settings.phase_steps
+        self._within(record, record.sequence, due, most, 'sequence')
+        self._due[record.source] = record.sequence + 1
