@@ -106,7 +106,7 @@ class Core:
     subscribes = (Transitions,)
     finished = False
     missing = None
-    phase = None
+    due = None
 
     def __init__(self):
         self.duplicated = Counter(transitions=2)

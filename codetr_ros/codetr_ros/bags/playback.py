@@ -187,7 +187,7 @@ class Playback:
 
     subscribes: tuple[type, ...] = (Metrics,)
     missing = None  # it takes no phases in
-    phase: int | None = None  # nor any that has phases
+    due = None
 
     def __init__(
         self,

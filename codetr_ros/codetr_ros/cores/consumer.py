@@ -80,6 +80,11 @@ class Consumer(Part, ABC):
         """The next phase to be learnt from."""
         return self._phase
 
+    @property
+    def due(self) -> int | None:
+        """The next phase to be learnt from."""
+        return self._phase
+
     def resume(self, newest: int | None = None) -> int:
         """Go on from the newest sound checkpoint of this run. Call it before `work`, if at all.
 

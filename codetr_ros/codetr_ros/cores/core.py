@@ -29,7 +29,7 @@ class Core(Protocol[Given_co]):
         """A committed phase that is incomplete; None if there is none."""
 
     @property
-    def phase(self) -> int | None:
+    def due(self) -> int | None:
         """The next phase to be finished here; None if there are none here."""
 
     @property
@@ -77,7 +77,7 @@ class Part:
         return None
 
     @property
-    def phase(self) -> int | None:
+    def due(self) -> int | None:
         """The next phase to be finished here; None if there are none here."""
         return None
 

@@ -243,6 +243,11 @@ class Recorder(Part):
             dropped=(),
         )
 
+    @property
+    def due(self) -> int | None:
+        """The next phase to be committed."""
+        return self.phase
+
     def waiting_for(self) -> str:
         """What the recorder waits for, for people: what the next phase still lacks."""
         members = self._members(self.phase)

@@ -118,7 +118,7 @@ class Simulator(Part):
         self._waiting[policy.phase] = policy, acting
 
     @property
-    def phase(self) -> int:
+    def due(self) -> int:
         """The next phase to be run."""
         return self._phase
 

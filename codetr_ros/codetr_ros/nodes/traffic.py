@@ -111,7 +111,7 @@ class Traffic:
         return taker.duplicated.total() == before
 
     def _check_phase(self, record: Record) -> None:
-        due, settings = self.core.phase, self.settings
+        due, settings = self.core.due, self.settings
         if due is None or settings is None or not isinstance(record, PHASED):
             return
         # so many commits reach a node that was started again and takes in earlier phases

@@ -14,6 +14,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
+from codetr_ros.nodes.traffic import arrived
 from codetr_ros.records import (
     TOPICS,
     Commit,
@@ -27,7 +28,6 @@ from codetr_ros.records import (
 )
 from codetr_ros.ros import messages, qos
 from codetr_ros.ros.link import UNDECODABLE
-from codetr_ros.ros.traffic import arrived
 
 WATCHED = (RunSpec, Presence, TaskSpec, Commit, EpisodeResult, Metrics)
 """Records that show how a run is going; the data themselves are left alone."""
