@@ -107,6 +107,7 @@ def outcome(tmp_path_factory):
         witness.say(*bad_transitions())
         witness.say(*bad_scores(witness.scores[0]))
         witness.say(policy(), of_another_architecture(settings))
+        witness.until(lambda: set(nodes.names) <= witness.readers('presence'))
         witness.say_bytes(*JUNK.items())
 
         def refused(node, topic):
@@ -208,15 +209,20 @@ def test_scores_that_fit_no_segment_are_refused_by_the_reward_node(outcome, why)
     assert 'nan' in why or "composite reward 7.5 of 'visitor' for 'sim'" in said[0]
 
 
-@pytest.mark.parametrize('node', ['sim', 'evaluate'])
-def test_a_policy_of_another_architecture_is_refused_naming_both(outcome, node):
-    said = next(s for s in outcome.refusals(node, 'policy') if 'architecture' in s)
+def test_a_policy_of_another_architecture_is_refused_naming_both(outcome):
+    said = next(s for s in outcome.refusals('evaluate', 'policy') if 'architecture' in s)
     settings = tiny()
     assert 'Policy(phase=5, version=5' in said
     assert f'needs {describe_network(OBSERVATION, ACTION, settings.sac.hidden)}' in said
     assert (
         f'the policy is {describe_network(OBSERVATION + 1, ACTION, settings.sac.hidden)}' in said
     )
+
+
+@pytest.mark.parametrize('node', ['sim', 'record'])
+def test_a_phase_that_cannot_have_begun_is_refused(outcome, node):
+    why = 'phase 5 cannot have begun: 2 is the next to be finished, so that 3 is the last'
+    assert sum(why in said for said in outcome.refusals(node, 'policy')) == 1
 
 
 def test_a_phase_that_is_permitted_twice_is_refused_by_the_simulator(outcome):
@@ -238,7 +244,7 @@ def test_every_refusal_is_counted_in_the_report_of_the_node(outcome):
         'reward': junk['reward'] + Counter({'transitions': 5, 'composite_rewards': 4}),
         'learner': junk['learner'] + Counter({'transitions': 5, 'run': 1}),
         'record': junk['record']
-        + Counter({'transitions': 5, 'composite_rewards': 2, 'policy': 1}),
+        + Counter({'transitions': 5, 'composite_rewards': 2, 'policy': 2}),
     }
 
 
