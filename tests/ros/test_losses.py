@@ -135,7 +135,7 @@ def test_diagnostics_tell_what_the_core_has_dropped_and_refused_later(member, pl
     witness.links['sim'].node.create_subscription(
         DiagnosticArray, '/diagnostics', heard.append, 10
     )
-    member.traffic.refuse('transitions', RecordError('wrong'))
+    member.traffic.refuse(Transitions, RecordError('wrong'))
 
     def said():
         member.publish_presence()

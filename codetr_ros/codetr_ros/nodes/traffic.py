@@ -95,7 +95,7 @@ class Traffic:
         try:
             return arrived(kind, data)
         except RecordError as error:
-            self.refuse(TOPICS[kind], error)
+            self.refuse(kind, error)
             return None
 
     def receive(self, record: Record, taker: Taker | None = None) -> bool:
@@ -106,7 +106,7 @@ class Traffic:
             self._check_phase(record)
             taker.receive(record)
         except RecordError as error:
-            self.refuse(TOPICS[type(record)], error)
+            self.refuse(type(record), error)
             return False
         return taker.duplicated.total() == before
 
@@ -123,7 +123,7 @@ class Traffic:
         try:
             self.receive_again(arrived(kind, data))
         except RecordError as error:
-            self.refuse(TOPICS[kind], error)
+            self.refuse(kind, error)
 
     def receive_again(self, record: Record) -> None:
         """Hand over a record that was fetched again; one that is new was lost before."""
@@ -131,8 +131,14 @@ class Traffic:
         if self.receive(record) and not isinstance(record, Commit):
             self.recovered[TOPICS[type(record)]] += 1
 
-    def refuse(self, topic: str, error: RecordError) -> None:
-        """Count a refusal; log the first ten on a topic, then every thousandth."""
+    def refuse(self, what: type | str, error: RecordError) -> None:
+        """Count a refusal; log the first ten on a topic, then every thousandth.
+
+        Args:
+            what: the kind of record, or the service whose answer it was.
+            error: why.
+        """
+        topic = what if isinstance(what, str) else TOPICS[what]
         self.refused[topic] += 1
         n = self.refused[topic]
         if worth_a_line(n):

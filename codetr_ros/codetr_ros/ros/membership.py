@@ -17,7 +17,6 @@ from codetr_ros.nodes.peers import Peers
 from codetr_ros.nodes.traffic import Traffic
 from codetr_ros.records import (
     PROTOCOL_VERSION,
-    TOPICS,
     Commit,
     Presence,
     RecordError,
@@ -197,7 +196,7 @@ class Membership:
             else:
                 self.traffic.receive(record)
         except RecordError as error:
-            self.traffic.refuse(TOPICS[kind], error)
+            self.traffic.refuse(kind, error)
 
     # ---- runs and peers
 

@@ -98,7 +98,7 @@ class Recording(Wiring):
             if self._early.holds(record, raw):
                 return
         except RecordError as error:
-            traffic.refuse(TOPICS[type(record)], error)
+            traffic.refuse(type(record), error)
             return
         core = self.joined.core
         learnt_from = type(record) in core.subscribes
