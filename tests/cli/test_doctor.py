@@ -1,3 +1,6 @@
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -67,3 +70,30 @@ def test_doctor_counts_what_dead_processes_left_in_shared_memory(tmp_path: Path)
 
 def test_doctor_says_when_shared_memory_is_missing(tmp_path: Path) -> None:
     assert doctor.shared_memory(tmp_path / 'none').status == 'warn'
+
+
+def test_doctor_finds_out_what_draws_and_names_why_nothing_does() -> None:
+    environ = {name: value for name, value in os.environ.items() if name != 'MUJOCO_GL'}
+    found = doctor.drawing(environ)
+    assert found.status in ('ok', 'warn')
+    assert ('egl' in found.detail) or ('osmesa' in found.detail)
+
+    none = doctor.drawing(environ | {'MUJOCO_GL': 'disable'})
+    assert (none.status, none.detail[:14]) == ('warn', 'none: disable:')
+    assert 'reports have no frames of the robot' in none.remedy
+
+
+def test_doctor_goes_on_where_mujoco_cannot_be_imported_with_its_driver() -> None:
+    program = 'from codetr_ros.cli import doctor; print(doctor.simulators())'
+    done = subprocess.run(
+        [sys.executable, '-c', program],
+        env=os.environ | {'MUJOCO_GL': 'nothing'},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "status='fail'" in done.stdout
+    assert 'MUJOCO_GL=nothing' in done.stdout
+    assert 'unset MUJOCO_GL' in done.stdout

@@ -14,17 +14,18 @@ import pytest
 import yaml
 
 from codetr_ros import cli, config
-from codetr_ros.cli import film
+from codetr_ros.cli import evaluate, film, rendering, video
 from codetr_ros.cores import in_process
-from codetr_ros.records import EpisodeResult, Record
+from codetr_ros.records import Commit, EpisodeResult, Record
 from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs.middle import Middle
 from codetr_ros.simulation import tasks
 
 SETTINGS = config.load('quick').changed(
     {
         'task': 'InvertedPendulum-v5',
         'method': 'uniform',
-        'steps': 200,
+        'steps': 400,
         'phase_steps': 100,
         'warmup_steps': 100,
         'evaluate_every': 100,
@@ -50,7 +51,13 @@ def a_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[EpisodeR
     folder = run_folder.create(tmp_path_factory.mktemp('runs') / 'tiny')
     run_folder.write_settings(folder, SETTINGS)
     records: list[Record] = []
-    in_process.run(SETTINGS, 'run', folder, records.append)
+    middle = Middle(folder, SETTINGS, print)
+
+    def observe(record: Record) -> None:
+        records.append(record)
+        middle.look(sum(isinstance(each, Commit) for each in records))
+
+    in_process.run(SETTINGS, 'run', folder, observe)
     results = [r for r in records if isinstance(r, EpisodeResult) and r.purpose != 'training']
     return folder, results
 
@@ -58,11 +65,8 @@ def a_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[EpisodeR
 @pytest.fixture(scope='module')
 def driver() -> str:
     """A driver that draws on this machine without a display."""
-    program = 'import mujoco, os\nmujoco.GLContext(8, 8).make_current()\nos._exit(0)'
-    for name in film.DRIVERS:
-        given = {**os.environ, 'MUJOCO_GL': name}
-        done = subprocess.run(child(program), env=given, capture_output=True, check=False)
-        if done.returncode == 0:
+    for name in rendering.DRIVERS:
+        if rendering.find({**os.environ, 'MUJOCO_GL': name}).driver == name:
             return name
     pytest.skip('neither EGL nor OSMesa draws on this machine')
 
@@ -73,19 +77,44 @@ def test_a_film_shows_the_episodes_of_the_runs_own_evaluations(
 ) -> None:
     run_dir, results = a_run
     random, last = results[0], results[-1]
-    assert (random.purpose, last.step) == ('random', 200)
+    (middle,) = [result for result in results if result.step == 200]
+    assert (random.purpose, last.step) == ('random', 400)
 
     note = film.make(run_dir, environment={**os.environ, 'MUJOCO_GL': driver})
 
-    lengths = f'random policy {random.length} steps, after 200 steps {last.length} steps'
+    lengths = (
+        f'random policy {random.length} steps, after 200 steps {middle.length} steps, '
+        f'after 400 steps {last.length} steps'
+    )
     assert f'It lasted: {lengths}. Drawing it took ' in note
     assert note.endswith(' s.'), note
     image = matplotlib.image.imread(io.BytesIO((run_dir / 'film.png').read_bytes()))
     height, width, _ = image.shape
     assert width == 960
-    # both rows have frames, which are not of one colour
-    for row in (image[: height // 2], image[height // 2 :]):
+    # all rows have frames, which are not of one colour
+    for row in np.split(image[: height // 3 * 3], 3):
         assert np.std(row[..., :3], axis=(0, 1)).min() > 0.05
+
+
+def test_the_policy_half_way_is_kept_and_later_ones_do_not_replace_it(
+    a_run: tuple[Path, list[EpisodeResult]],
+) -> None:
+    folder, _ = a_run
+    (kept,) = (folder / run_folder.MIDDLE).iterdir()
+    assert kept.name == 'learner-000001'
+    settings = evaluate.settings_to_read(folder)
+    policy = evaluate.newest_policy(folder, settings, folder / run_folder.MIDDLE)
+    assert (policy.version, settings.steps_after(policy.version)) == (1, 200)
+    assert not list(folder.glob('.*'))
+
+
+def test_a_run_that_has_learnt_nothing_half_way_keeps_no_policy(tmp_path: Path) -> None:
+    (tmp_path / 'checkpoints' / 'learner-000002').mkdir(parents=True)
+    short = SETTINGS.changed({'warmup_steps': 300})
+    Middle(tmp_path, short, print).look(4)
+    assert not (tmp_path / run_folder.MIDDLE).exists()
+    Middle(tmp_path, SETTINGS, print).look(4)
+    assert (tmp_path / run_folder.MIDDLE / 'learner-000002').is_dir()
 
 
 @pytest.mark.slow
@@ -184,3 +213,69 @@ def test_train_and_report_put_the_film_into_the_report(
     page = (folder / 'report.html').read_text()
     assert 'No new frames of the robot: MuJoCo cannot draw here (disable: ' in page
     assert base64.b64encode((folder / 'film.png').read_bytes()).decode() in page
+
+
+@pytest.mark.slow
+def test_a_video_shows_the_episodes_that_are_evaluated_in_their_own_time(
+    a_run: tuple[Path, list[EpisodeResult]], driver: str, tmp_path: Path
+) -> None:
+    import imageio_ffmpeg
+
+    folder, _ = a_run
+    settings = evaluate.settings_to_read(folder).changed({'evaluate_episodes': 2, 'seed': 3}, '')
+    results = evaluate.evaluate(evaluate.newest_policy(folder, settings), settings)
+    file = tmp_path / 'out.mp4'
+
+    text = video.make(folder, file, settings, environment={**os.environ, 'MUJOCO_GL': driver})
+
+    returns = ', '.join(f'{result.true_return:.6g}' for result in results)
+    assert '2 episodes after 400 steps, ' in text
+    assert text.endswith(f'true returns {returns} (drawn by {driver})')
+    frames = imageio_ffmpeg.read_frames(str(file))
+    said = next(frames)
+    assert said['size'] == (video.WIDTH, video.HEIGHT)
+    assert said['fps'] == 25.0, 'a step of this task takes 0.04 s'
+    shown = [np.frombuffer(frame, np.uint8) for frame in frames]
+    assert len(shown) == sum(result.length for result in results)
+    assert all(frame.std() > 5 for frame in shown)
+    assert np.abs(shown[0].astype(int) - shown[results[0].length - 1]).mean() > 0.2, 'it moves'
+    assert [path.name for path in tmp_path.iterdir()] == ['out.mp4']
+
+
+@pytest.mark.slow
+def test_where_nothing_can_be_drawn_the_evaluation_is_printed_and_the_reason(
+    a_run: tuple[Path, list[EpisodeResult]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for name, value in os.environ.items():  # what `codetr evaluate` sets ends with this test
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv('MUJOCO_GL', 'disable')
+    file = tmp_path / 'out.mp4'
+    assert cli.main(['evaluate', str(a_run[0]), '--video', str(file)]) == cli.FAILED
+    said = capsys.readouterr()
+    assert 'true return' in said.out
+    assert f'no video {file}: MuJoCo cannot draw here (disable: ' in said.err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ('name', 'words'),
+    [
+        ('out.avi', 'must end with .mp4'),
+        ('nowhere/out.mp4', 'nowhere cannot be written: No such file or directory'),
+    ],
+)
+def test_a_video_that_cannot_be_written_is_refused_before_anything_is_run(
+    a_run: tuple[Path, list[EpisodeResult]],
+    name: str,
+    words: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    file = str(tmp_path / name)
+    assert cli.main(['evaluate', str(a_run[0]), '--video', file]) == cli.USAGE
+    said = capsys.readouterr()
+    assert words in said.err
+    assert said.out == ''

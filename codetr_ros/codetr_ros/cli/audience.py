@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from codetr_ros.cli.beside import Beside
 from codetr_ros.records import Record
 from codetr_ros.runs.live import Live
+from codetr_ros.runs.middle import Middle
 from codetr_ros.runs.progress import Progress
 from codetr_ros.runs.summary import Summary
 from codetr_ros.runs.tensorboard import Events
@@ -20,6 +21,7 @@ class Audience:
         live: writes the files that change while the run lasts.
         events: writes TensorBoard's events; None: nobody asked for them.
         page: serves the page of the run; None: nobody asked for it.
+        middle: keeps the policy of the middle of the run; None: nobody draws it.
     """
 
     summary: Summary
@@ -27,6 +29,7 @@ class Audience:
     live: Live
     events: Events | None = None
     page: Beside | None = None
+    middle: Middle | None = None
 
     def receive(self, record: Record) -> None:
         """Hand on a record."""
@@ -42,6 +45,8 @@ class Audience:
         self.live.tick()
         if self.page is not None:
             self.page.tick()
+        if self.middle is not None:
+            self.middle.look(self.summary.phases)
 
     def end(self) -> None:
         """Write what is left of the events."""

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
+from codetr_ros.cli import rendering
 from codetr_ros.records import PROTOCOL_VERSION, ROLES
 from codetr_ros.system import compilation, processors
 from codetr_ros.system.versions import version_of
@@ -213,6 +214,11 @@ def simulators() -> Check:
         importlib.import_module('mujoco')
     except ImportError as error:
         return Check('MuJoCo', 'fail', f'cannot be imported: {error}', _INSTALL)
+    except Exception as error:  # noqa: BLE001  it imports its driver: whatever that raises
+        named = f'MUJOCO_GL={os.environ.get("MUJOCO_GL", "")}'
+        remedy = 'no run works with a driver that is not there: unset MUJOCO_GL'
+        detail = f'cannot be imported with {named}: {type(error).__name__}: {error}'
+        return Check('MuJoCo', 'fail', detail, remedy)
     if not versions['gymnasium']:
         return Check('MuJoCo', 'fail', detail, _INSTALL)
     if not versions['dm-control']:
@@ -220,6 +226,19 @@ def simulators() -> Check:
     if versions['mujoco'] and int(versions['mujoco'].split('.')[0]) >= 4:
         return Check('MuJoCo', 'warn', detail, 'dm_control breaks with mujoco 4: install mujoco<4')
     return Check('MuJoCo', 'ok', detail)
+
+
+def drawing(environ: Mapping[str, str] = os.environ) -> Check:
+    """What draws the robot without a display: for reports, videos and pages."""
+    drawn = rendering.find(environ)
+    if drawn.driver is None:
+        remedy = (
+            'reports have no frames of the robot, and there are no videos; nothing else needs it. '
+            'Install Mesa (libegl1 and libgl1-mesa-dri, or libosmesa6)'
+        )
+        return Check('rendering', 'warn', f'none: {drawn.text}', remedy)
+    asked = ' (MUJOCO_GL is set)' if environ.get('MUJOCO_GL') else ''
+    return Check('rendering', 'ok', f'MuJoCo draws with {drawn.driver}{asked}')
 
 
 CHECKS: tuple[Callable[[], Check | list[Check]], ...] = (
@@ -234,6 +253,7 @@ CHECKS: tuple[Callable[[], Check | list[Check]], ...] = (
     torch,
     compiler,
     simulators,
+    drawing,
 )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import tyro
 from rich.table import Table
 
-from codetr_ros.cli import refuse
+from codetr_ros.cli import FAILED, refuse, video
 from codetr_ros.cli.terminal import console, parse_arguments
 from codetr_ros.config import Settings, SettingsError
 from codetr_ros.processes.openmp import threading_environment
@@ -37,6 +37,13 @@ class Arguments:
     seed: Annotated[
         int | None, tyro.conf.arg(metavar='K', help="seed of start states; by default the run's")
     ] = None
+    video: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar='FILE.mp4',
+            help='also draw the episodes, from the first on until half a minute is full',
+        ),
+    ] = None
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -50,7 +57,9 @@ def main(arguments: Sequence[str]) -> int:
         if given.seed is not None:
             changes['seed'] = given.seed
         settings = settings_to_read(folder).changed(changes, 'command line')
-    except (RunFolderError, SettingsError) as error:
+        if given.video is not None:
+            video.check(Path(given.video))
+    except (RunFolderError, SettingsError, video.VideoError) as error:
         return refuse(str(error))
     os.environ.update(threading_environment(settings))
 
@@ -78,6 +87,13 @@ def main(arguments: Sequence[str]) -> int:
         f'{len(results)} episodes, seed {settings.seed}',
     )
     shown.print(table(results))
+    if given.video is None:
+        return 0
+    try:
+        shown.print(video.make(folder, Path(given.video), settings))
+    except video.VideoError as error:
+        console(stderr=True).print(f'codetr: {error}')
+        return FAILED
     return 0
 
 
@@ -94,8 +110,13 @@ def settings_to_read(folder: Path) -> Settings:
     return run_folder.read_settings(folder).changed(changes, str(folder))
 
 
-def newest_policy(folder: Path, settings: Settings) -> Policy:
+def newest_policy(folder: Path, settings: Settings, place: Path | None = None) -> Policy:
     """The policy of the learner's newest checkpoint, as the learner would publish it.
+
+    Args:
+        folder: of the run.
+        settings: of the run.
+        place: the folder of the checkpoints; None: that of the run.
 
     Raises:
         RunFolderError: there is no checkpoint, or none with a policy that has learnt.
@@ -107,7 +128,7 @@ def newest_policy(folder: Path, settings: Settings) -> Policy:
     from codetr_ros.policy.actor import weights_bytes
     from codetr_ros.runs import checkpoints
 
-    place = folder / run_folder.CHECKPOINTS
+    place = place or folder / run_folder.CHECKPOINTS
     path = checkpoints.latest(place, 'learner')
     if path is None:
         raise RunFolderError(

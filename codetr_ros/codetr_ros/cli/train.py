@@ -30,6 +30,7 @@ from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import reports as node_reports
 from codetr_ros.runs.folder import RunFolderError
 from codetr_ros.runs.live import Live, State
+from codetr_ros.runs.middle import Middle
 from codetr_ros.runs.progress import Progress
 from codetr_ros.runs.reports import NodeReport
 from codetr_ros.runs.summary import Summary
@@ -196,7 +197,8 @@ def train(
     if shown.tensorboard:
         events = Events(folder / run_folder.TENSORBOARD, settings, progress.log)
     page = Beside(folder, progress.log) if shown.watch else None
-    audience = Audience(summary, progress, live, events, page)
+    middle = Middle(folder, settings, progress.log) if shown.film else None
+    audience = Audience(summary, progress, live, events, page, middle)
     with Interrupts() as interrupts, page or nullcontext():
         with progress:
             way = _in_process if topics is None else partial(_over_topics, topics)

@@ -112,8 +112,7 @@ class Evaluator(Part):
     ) -> EpisodeResult:
         """Run one episode, from the start state that its number gives."""
         seed, episode, environment = self._settings.seed, self._episode, self._environment
-        seed_global(seed, 'environment', 'evaluate', number)
-        episode.reset(int(generator(seed, 'evaluate', number).integers(2**31)), number)
+        begin(episode, seed, number)
         if acting is None:
             rng = generator(seed, 'evaluate', 'random', number)
             actions = uniform_actions(rng, environment.horizon, environment.action_size)
@@ -136,3 +135,15 @@ class Evaluator(Part):
     def report(self) -> CoreReport:
         """Counts for the run's summary."""
         return CoreReport(lost={}, duplicated={}, counters=dict(self._counters))
+
+
+def begin(episode: EpisodeRunner, seed: int, number: int) -> None:
+    """Begin an episode of an evaluation.
+
+    Args:
+        episode: runs it.
+        seed: of the run.
+        number: of the episode within the evaluation; it decides the start state.
+    """
+    seed_global(seed, 'environment', 'evaluate', number)
+    episode.reset(int(generator(seed, 'evaluate', number).integers(2**31)), number)

@@ -47,7 +47,7 @@ class Material:
     Attributes:
         columns: of `metrics.csv`.
         segments: some, step by step.
-        film: a picture of the robot under the first and the last policy; None if there is none.
+        film: a picture of the robot under its policies; None if there is none.
         film_note: what to know about it, or why there is none.
         files: those of the run's folder, each with what it is.
         notes: what could not be read.
@@ -153,7 +153,7 @@ def page(summary: RunSummary, picture: bytes, material: Material | None = None) 
 def _film(given: Material) -> Iterator[Block]:
     if given.film is None and not given.film_note:
         return
-    yield Heading('The robot under the first and the last policy')
+    yield Heading('The robot under the first, the middle and the last policy')
     if given.film is not None:
         yield Picture(given.film, 'frames of an episode of each policy')
     if given.film_note:

@@ -26,6 +26,7 @@ FILES = (
     (run_folder.METRICS, 'a row for each phase: returns, losses, times'),
     (run_folder.STEP_REWARDS, 'the step rewards of the segments shown above'),
     (run_folder.CHECKPOINTS, 'the last policies and reward models'),
+    (run_folder.MIDDLE, 'the policy half-way, for the film'),
     (run_folder.NODES, 'a report of each node'),
     (run_folder.LOGS, 'the output of each node'),
     (run_folder.STATUS, 'who took part and how far the run came, as codetr watch shows it'),

@@ -1,0 +1,182 @@
+"""A video of a run's policy: `codetr evaluate RUN --video out.mp4`.
+
+It is drawn in a process of its own (see `rendering`):
+`python -m codetr_ros.cli.video FOLDER FILE EPISODES SEED`.
+"""
+
+import math
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from codetr_ros.cli import rendering
+from codetr_ros.processes import launcher
+from codetr_ros.system.files import FileError, check_writable, sync_folder
+
+if TYPE_CHECKING:
+    from codetr_ros.config import Settings
+    from codetr_ros.records import F32
+    from codetr_ros.simulation.drawing import Frame
+    from codetr_ros.simulation.episode import EpisodeRunner
+
+PROGRAM = (sys.executable, '-m', 'codetr_ros.cli.video')
+DEADLINE = 600.0
+"""Seconds after which a video is given up. Without a GPU, one takes about a minute."""
+WIDTH, HEIGHT = 640, 480
+SECONDS = 30.0
+"""No further episode begins once a video is so long."""
+MOST_FRAMES = 50.0
+"""A second. What is simulated in smaller steps shows some of them, in the same time."""
+UNKNOWN_PERIOD = 0.04
+"""Seconds that a step is shown, where the task has no time."""
+SUFFIX = '.mp4'
+
+
+class VideoError(RuntimeError):
+    """A video that cannot be made: the message names the file, the reason and the remedy."""
+
+
+def check(file: Path) -> None:
+    """Check that a video may be written there.
+
+    Raises:
+        VideoError: it is no `.mp4`, or its folder cannot be written.
+    """
+    if file.suffix != SUFFIX:
+        raise VideoError(f'--video {file} must end with {SUFFIX}')
+    try:
+        check_writable(file.absolute().parent)
+    except FileError as error:
+        raise VideoError(f'--video {error}') from None
+
+
+def make(
+    folder: Path,
+    file: Path,
+    settings: 'Settings',
+    program: Sequence[str] = PROGRAM,
+    environment: Mapping[str, str] = os.environ,
+) -> str:
+    """Draw a video of a run's newest policy.
+
+    Args:
+        folder: the run's folder.
+        file: the video; an existing one is replaced.
+        settings: of the evaluation: the episodes, and the seed of their start states.
+        program: draws the video; the last arguments are given here.
+        environment: variables of the program; MUJOCO_GL in it is the only driver that is tried.
+
+    Returns:
+        What to know about the video.
+
+    Raises:
+        VideoError: it cannot be drawn.
+    """
+    arguments = (str(folder), str(file), str(settings.evaluate_episodes), str(settings.seed))
+    given = {**environment, **launcher.module_environment(settings, environment)}
+    partial = _partial(file)
+    try:
+        drawn = rendering.draw([*program, *arguments], partial, DEADLINE, given)
+        if drawn.driver is not None:
+            os.replace(partial, file)
+            sync_folder(file.absolute().parent)
+            return f'{file}: {drawn.text} (drawn by {drawn.driver})'
+    finally:
+        partial.unlink(missing_ok=True)
+    if not drawn.possible:
+        raise VideoError(f'no video {file}: {drawn.text}')
+    raise VideoError(
+        f'no video {file}: MuJoCo cannot draw here ({drawn.text}). `codetr doctor` says what it '
+        'needs'
+    )
+
+
+def _partial(file: Path) -> Path:
+    """Where a video is written first; ffmpeg knows its format by the end of its name."""
+    return file.with_name(f'.{file.stem}.partial{SUFFIX}')
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Draw a video of the run in this folder; returns the exit code."""
+    folder, file, episodes, seed = arguments
+
+    def made() -> str:
+        from codetr_ros.cli import evaluate
+
+        changes = {'evaluate_episodes': int(episodes), 'seed': int(seed)}
+        settings = evaluate.settings_to_read(Path(folder)).changed(changes, 'video')
+        return film(Path(folder), _partial(Path(file)), settings)
+
+    return rendering.run(made, WIDTH, HEIGHT)
+
+
+def film(folder: Path, file: Path, settings: 'Settings') -> str:
+    """Draw the episodes of an evaluation into a file; returns what to know about them.
+
+    Raises:
+        TaskError: the task cannot be made or drawn.
+    """
+    import torch
+    from imageio_ffmpeg import write_frames
+
+    from codetr_ros.cli import evaluate
+    from codetr_ros.seeding import seed_global
+    from codetr_ros.simulation import tasks
+    from codetr_ros.simulation.drawing import Drawing
+    from codetr_ros.simulation.episode import EpisodeRunner
+    from codetr_ros.simulation.permission import acting_policy
+
+    torch.set_num_threads(settings.thread_count)
+    policy = evaluate.newest_policy(folder, settings)
+    seed_global(settings.seed, 'environment')
+    environment = tasks.make(settings.task)
+    acting = acting_policy(policy, environment, settings)
+    assert acting is not None, 'newest_policy gives none that is random'
+    runner = EpisodeRunner(environment, settings, 'evaluate')
+    period = environment.control_period or UNKNOWN_PERIOD
+    every = max(1, math.ceil(1 / (period * MOST_FRAMES) - 1e-9))
+    rate = 1 / (period * every)
+    returns: list[float] = []
+    writer = write_frames(
+        str(file), (WIDTH, HEIGHT), fps=rate, macro_block_size=2, output_params=['-v', 'error']
+    )
+    writer.send(None)
+    shown = 0
+    with Drawing(environment, WIDTH, HEIGHT) as drawing:
+        for number in range(settings.evaluate_episodes):
+            if shown >= SECONDS * rate:
+                break
+            steps = _episode(runner, settings.seed, number, acting.act)
+            total = 0.0
+            for step, reward in enumerate(steps):
+                total += reward
+                if step % every == 0 or runner.over:
+                    frame: Frame = drawing.frame()
+                    writer.send(frame.tobytes())
+                    shown += 1
+            returns.append(total)
+    writer.close()
+    many = f'{len(returns)} episode' + 's' * (len(returns) != 1)
+    listed = ', '.join(f'{value:.6g}' for value in returns)
+    return (
+        f'{many} after {settings.steps_after(policy.version)} steps, {shown} frames at {rate:.4g} '
+        f'a second, true returns {listed}'
+    )
+
+
+def _episode(
+    runner: 'EpisodeRunner', seed: int, number: int, act: Callable[..., 'F32']
+) -> Iterator[float]:
+    """Run an episode of the evaluation step by step; yields the rewards."""
+    from codetr_ros.cores.evaluator import begin
+
+    begin(runner, seed, number)
+    while not runner.over:
+        reward, _ = runner.step(act(runner.observation, step=runner.place))
+        yield reward
+
+
+if __name__ == '__main__':
+    rendering.end(main(sys.argv[1:]))
