@@ -12,11 +12,12 @@ BENCH ?= simulator sac_updates codetr_speed nodes throughput recording_overhead 
 unexport PYTHONPATH PYTHONHOME LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE AMENT_PREFIX_PATH
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test coverage lint format docs bench clean
+.PHONY: help setup train robot test coverage lint format docs bench clean
 
 help:
 	@echo "make train    set up what is missing, then learn the default task and watch it    (codetr train)"
 	@echo "make test     set up what is missing, then run all tests, lint and types included (pytest)"
+	@echo "make robot    set up what is missing, then let a robot in real time learn from scores     (codetr demo robot)"
 	@echo "make coverage the same tests, and what they do not reach: a table, and pages in htmlcov/"
 	@echo "make lint     lint, format and type checks alone"
 	@echo "make bench    measure how fast everything is, some three hours on a machine that does nothing else (benchmarks/)"
@@ -35,6 +36,9 @@ setup:
 			"apt install python3 python3-venv python3-dev) or name one that you have:" \
 			"make test PYTHON=/path/to/python3.12" >&2; exit 1; }
 	@'$(PYTHON)' bootstrap.py
+
+robot: setup
+	@$(VENV)/bin/codetr demo robot $(ARGS)
 
 train: setup
 	@$(VENV)/bin/codetr train $(ARGS)

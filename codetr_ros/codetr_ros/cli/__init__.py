@@ -23,6 +23,7 @@ commands:
   evaluate   evaluate the policy of a run's newest checkpoint
   benchmark  do many runs under one protocol, and make a table of them
   bag        show, check, recover or play a bag
+  demo       a whole example in one command: a robot in real time
   tasks      list the tasks that have a name
   simtest    simulate whole runs in which messages, disks and nodes fail
   doctor     check Python, ROS, discovery, shared memory, torch and MuJoCo
@@ -86,6 +87,12 @@ def _bag(arguments: Sequence[str]) -> int:
     return bag.main(arguments)
 
 
+def _demo(arguments: Sequence[str]) -> int:
+    from codetr_ros.cli import demo
+
+    return demo.main(arguments)
+
+
 def _tasks(arguments: Sequence[str]) -> int:
     from codetr_ros.cli import list_tasks
 
@@ -114,6 +121,7 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     'watch': _watch,
     'benchmark': _benchmark,
     'bag': _bag,
+    'demo': _demo,
     'tasks': _tasks,
     'simtest': _simtest,
     'doctor': _doctor,

@@ -55,11 +55,13 @@ class Topics:
         namespace: that of the nodes; None: one of the run's own.
         peer_deadline: seconds that they wait for each other; 0: for ever.
         start: starts each.
+        robot: parameters of the robot node, where the task is that of a robot.
     """
 
     namespace: str | None = None
     peer_deadline: float = PEER_DEADLINE
     start: launcher.Start = launcher.start_program
+    robot: Mapping[str, str | bool] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -289,7 +291,12 @@ def _over_topics(
 ) -> Outcome:
     namespace = topics.namespace or launcher.namespace_of(run_id)
     commands = launcher.commands(
-        settings, run_id, folder, namespace=namespace, peer_deadline=topics.peer_deadline
+        settings,
+        run_id,
+        folder,
+        namespace=namespace,
+        peer_deadline=topics.peer_deadline,
+        robot=topics.robot,
     )
     watch = _watcher(settings)
     silence, summary, progress = Silence(), audience.summary, audience.progress

@@ -28,6 +28,8 @@ STOP_DEADLINE = 20.0
 """Seconds from SIGINT to SIGKILL, in which a node ends its slice and writes a checkpoint."""
 HURRIED_DEADLINE = 2.0
 """The same after a second Ctrl-C."""
+ROBOT_NODE = 'robot'
+"""The executable, and the node, that drives a robot in place of a simulator."""
 _POLL = 0.02  # seconds between checks of processes that are to end
 
 
@@ -50,14 +52,16 @@ class Command:
     arguments: tuple[str, ...]
 
 
-def executable(role: str, environ: Mapping[str, str] = os.environ) -> Path:
+def executable(
+    role: str, environ: Mapping[str, str] = os.environ, program: str | None = None
+) -> Path:
     """Find a node's executable: in this environment's prefix, else through AMENT_PREFIX_PATH.
 
     Raises:
         LaunchError: it is in none of them; names the places, and how to build or source the
             workspace.
     """
-    package, name = roles.TABLE[role].package, roles.TABLE[role].executable
+    package, name = roles.TABLE[role].package, program or roles.TABLE[role].executable
     prefixes = [sys.prefix, *filter(None, environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep))]
     for prefix in prefixes:
         path = Path(prefix) / 'lib' / package / name
@@ -84,6 +88,7 @@ def commands(
     *,
     namespace: str | None = None,
     peer_deadline: float | None = None,
+    robot: Mapping[str, str | bool] | None = None,
 ) -> list[Command]:
     """The processes of a run, in the order in which they start; any order would do.
 
@@ -95,19 +100,24 @@ def commands(
         namespace: that of the run; None: `namespace_of(run_id)`.
         peer_deadline: seconds that nodes wait for each other, 0 for ever; None: as they do by
             themselves.
+        robot: parameters of the robot node, where the task is that of a robot.
 
     Raises:
         LaunchError: an executable is missing.
     """
-    nodes = [(name, 'sim') for name in settings.simulator_names]
+    names = (ROBOT_NODE,) if settings.on_robot else settings.simulator_names
+    nodes = [(name, 'sim') for name in names]
     nodes += [(role, role) for role in settings.roles if role != 'sim']
     processes = []
     for name, role in nodes:
-        arguments = [str(executable(role, environ)), '--ros-args']
+        program = ROBOT_NODE if name == ROBOT_NODE else None
+        arguments = [str(executable(role, environ, program)), '--ros-args']
         arguments += ['-r', f'__ns:={namespace or namespace_of(run_id)}']
-        if role == 'sim' and name != 'sim':
+        if role == 'sim' and name not in ('sim', ROBOT_NODE):
             arguments += ['-r', f'__node:={name}']
-        parameters = {'folder': str(folder)}
+        parameters: dict[str, str | bool] = {'folder': str(folder)}
+        if name == ROBOT_NODE:
+            parameters |= robot or {}
         if role == 'learner':
             parameters |= {'config': str(folder / run_folder.CONFIG), 'run_id': run_id}
         for parameter, value in parameters.items():
