@@ -1,9 +1,10 @@
-"""Take the pictures of what one sees: the terminal of the default run, and its report.
+"""Take the pictures of what one sees: the terminal of the default run, its report, and its page.
 
     .venv/bin/python docs/pictures/take.py [--run-folder DIR]
 
 The run is a real one, over topics, in a terminal of 92 columns. What it leaves on the screen
-becomes terminal.svg, and a headless Chromium photographs the report: report.png.
+becomes terminal.svg. A headless Chromium photographs the report, and the page of `codetr watch`:
+report.png and watch.png.
 """
 
 import argparse
@@ -97,8 +98,31 @@ def photographed(page: Path, picture: Path, size: str) -> None:
         subprocess.run([browser, *flags, page.as_uri()], check=True, capture_output=True)
 
 
+def watched(folder: Path, picture: Path) -> None:
+    """Photograph the page of `codetr watch`."""
+    from playwright.sync_api import sync_playwright
+
+    from codetr_ros.pages.feed import Feed
+    from codetr_ros.pages.watching import RunSource, serve
+    from codetr_ros.runs.folder import read_settings
+
+    feed = Feed()
+    source = RunSource(folder, read_settings(folder), feed)
+    source.poll()
+    with serve(source, feed) as server, sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=shutil.which('chromium'), args=['--headless', '--no-sandbox']
+        )
+        tab = browser.new_page(viewport={'width': 1200, 'height': 900})
+        tab.goto(server.url)
+        tab.wait_for_selector('#rewards canvas')
+        tab.wait_for_load_state('load')
+        tab.screenshot(path=picture, full_page=True)
+        browser.close()
+
+
 def main() -> None:
-    """Make both pictures."""
+    """Make the pictures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--run-folder', type=Path, default=Path('runs/pictures'))
     folder = parser.parse_args().run_folder
@@ -106,6 +130,7 @@ def main() -> None:
     output = recorded([codetr, 'train', '--out', str(folder)])
     (HERE / 'terminal.svg').write_text(drawn(screen(output), 'make train'))
     photographed(folder.resolve() / 'report.html', HERE / 'report.png', '1000,1460')
+    watched(folder, HERE / 'watch.png')
 
 
 if __name__ == '__main__':

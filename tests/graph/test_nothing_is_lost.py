@@ -1,5 +1,6 @@
 """What was published is in the bag, all of it, and the summary says the same."""
 
+import json
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from codetr_ros.config import Settings, load
+from codetr_ros.records import ROLES
 from helpers.builders import tiny
 from helpers.runs import train
 
@@ -110,6 +112,9 @@ def test_the_default_run_loses_nothing_and_its_bag_holds_everything(tmp_path):
     check(summary, settings)
     assert summary['steps'] == 4000 and summary['phases'] == 4
     assert 'lost' in said
+    status = json.loads((tmp_path / 'run' / 'status.json').read_text())
+    assert (status['state'], status['phase'], status['lost']) == ('finished', 4, 0)
+    assert {node['role'] for node in status['nodes']} == set(ROLES)
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -32,8 +33,9 @@ from codetr_ros.runs.summary import Summary
 from helpers.bags import SETTINGS as OF_BAG
 from helpers.bags import a_run as bag_records
 from helpers.bags import encode, topic_of
-from helpers.builders import score, step_rewards, transitions
+from helpers.builders import score, step_rewards, tiny, transitions
 from helpers.http import ask
+from helpers.runs import write
 from helpers.summaries import SETTINGS, Clock
 from helpers.summaries import a_run as table_records
 
@@ -310,3 +312,35 @@ def test_a_folder_of_no_run_is_refused(tmp_path: Path):
     _, said = done.communicate(timeout=60)
     assert done.returncode == 2
     assert 'is not the folder of a run' in said
+
+
+@pytest.mark.slow
+def test_a_run_is_watched_while_it_is_trained_until_its_end(tmp_path: Path, tab):
+    folder = tmp_path / 'run'
+    config = write(tiny(), folder)
+    flags = ('--in-process', '--watch', '--no-film', '--config', str(config))
+    started = program('train', '--out', str(folder), *flags)
+    watchdog = threading.Timer(200, started.kill)
+    watchdog.start()
+    try:
+        url = None
+        for line in started.stdout:
+            if match := re.search(r'http://\S+', line):
+                url = match[0]
+                break
+        started.send_signal(signal.SIGSTOP)  # so that it does not end before it was looked at
+        page = tab(url)
+        page.wait_for_selector('#state:has-text("running")')
+        page.wait_for_selector('#nodes:has-text("5 take part")')
+        started.send_signal(signal.SIGCONT)
+        page.wait_for_selector('#state:has-text("finished")', timeout=120_000)
+        assert '6 of 6' in page.inner_text('#facts')
+        page.wait_for_selector('#rewards canvas')
+        said = started.stdout.read()
+        assert started.wait(60) == 0, said
+        page.wait_for_selector('#link:has-text("codetr watch shows the run again")')
+    finally:
+        watchdog.cancel()
+        started.kill()
+        started.communicate()
+    assert (folder / 'logs' / 'watch.log').read_text() == ''

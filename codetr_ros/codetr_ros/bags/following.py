@@ -31,6 +31,7 @@ class Follower:
         self._tail = tail
         self._read: dict[str, int] = {}  # file name -> where its next record begins
         self._known: dict[str, McapChannels] = {}
+        self._sizes: dict[str, int] = {}  # of the files at the last call
         self.faults: list[Damage] = []
         self.left_out = 0
 
@@ -40,8 +41,10 @@ class Follower:
         A chunk that is half written is left for the next call.
         """
         names = {type_name(kind) for kind in kinds}
-        if not self._folder.is_dir() or not any(self._folder.glob('*.mcap')):
-            return
+        sizes = {path.name: path.stat().st_size for path in self._folder.glob('*.mcap')}
+        if sizes == self._sizes:
+            return  # often asked, and the metadata of a finished bag takes a while to read
+        self._sizes = sizes
         try:
             bag = Bag(self._folder, self.faults.append)
         except BagError as error:
