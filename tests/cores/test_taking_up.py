@@ -1,12 +1,16 @@
 """A run in process that was ended at any moment goes on from its bag, to the bit."""
 
+import shutil
+
 import pytest
 
+from codetr_ros.bags.errors import BagError
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.verify import verify
 from codetr_ros.config import settled
 from codetr_ros.cores import in_process
 from codetr_ros.cores.taking_up import take_up
+from codetr_ros.runs import checkpoints
 from helpers.builders import tiny
 from helpers.records import content
 
@@ -91,3 +95,74 @@ def test_a_run_that_was_ended_anywhere_ends_as_an_undisturbed_one(
     assert records(tmp_path) == records(folder)
     verdict = verify(tmp_path / 'bag')
     assert verdict.sound, verdict.report()
+
+
+@pytest.mark.parametrize('steps', [600, 500, 400, 150])
+def test_a_finished_run_goes_on_as_if_it_had_been_longer_from_the_start(
+    steps, undisturbed, tmp_path, caplog
+):
+    """600 ends with a phase, 500 and 150 within one, 400 with the warm-up."""
+    reports, folder, _ = undisturbed('codetr')
+    settings = small(**CASES['codetr'])
+    in_process.run(settings.changed({'steps': steps}), 'run', tmp_path, bag=True)
+    again = take_up(settings, 'run', tmp_path)
+    assert again['learner'].policy_sha256 == reports['learner'].policy_sha256
+    assert {name: compared(r) for name, r in again.items()} == {
+        name: compared(r) for name, r in reports.items()
+    }
+    assert records(tmp_path) == records(folder)
+    assert verify(tmp_path / 'bag').sound
+    assert ('is done again' in caplog.text) == bool(steps % 200)
+
+
+@pytest.fixture
+def halfway(undisturbed, tmp_path):
+    """A run that was ended behind its second half, and what it is to end as."""
+    reports, _, count = undisturbed('codetr')
+    settings = small(**CASES['codetr'])
+    killed_after(settings, tmp_path, int(0.8 * count))
+    return settings, tmp_path, reports['learner'].policy_sha256
+
+
+@pytest.mark.parametrize('newest', ['learner', 'reward'])
+def test_the_checkpoint_before_a_damaged_one_is_taken(newest, halfway, caplog):
+    settings, folder, digest = halfway
+    path = sorted((folder / 'checkpoints').glob(f'{newest}-*'))[-1] / checkpoints.TENSORS
+    path.write_bytes(path.read_bytes()[:-5])
+    assert take_up(settings, 'run', folder)['learner'].policy_sha256 == digest
+
+
+def test_without_checkpoints_all_is_learnt_again_from_the_bag(halfway, caplog):
+    settings, folder, digest = halfway
+    shutil.rmtree(folder / 'checkpoints')
+    assert take_up(settings, 'run', folder)['learner'].policy_sha256 == digest
+    assert 'all phases are learnt from again' in caplog.text
+
+
+def test_a_bag_cut_anywhere_gives_the_same_weights(halfway, caplog):
+    settings, folder, digest = halfway
+    bag = folder / 'bag' / 'bag_0.mcap'
+    whole = bag.read_bytes()
+    bag.write_bytes(whole[: len(whole) // 2])
+    assert take_up(settings, 'run', folder)['learner'].policy_sha256 == digest
+    assert 'the bag ends with the commit of phase' in caplog.text
+
+
+def test_a_bag_with_other_settings_or_of_another_run_is_refused_unchanged(halfway):
+    settings, folder, _ = halfway
+    before = {path: path.read_bytes() for path in folder.rglob('*') if path.is_file()}
+    with pytest.raises(BagError, match='is of a run with seed = 0 .here 3.*only steps may change'):
+        take_up(settings.changed({'seed': 3}), 'run', folder)
+    with pytest.raises(BagError, match="holds run 'run', not 'other'"):
+        take_up(settings, 'other', folder)
+    assert before == {path: path.read_bytes() for path in folder.rglob('*') if path.is_file()}
+
+
+def test_a_bag_that_is_damaged_before_its_last_commit_is_refused(halfway):
+    settings, folder, _ = halfway
+    bag = folder / 'bag' / 'bag_0.mcap'
+    content = bytearray(bag.read_bytes())
+    content[len(content) // 2] ^= 1
+    bag.write_bytes(content)
+    with pytest.raises(BagError, match='a commit lies behind it'):
+        take_up(settings, 'run', folder)

@@ -63,7 +63,7 @@ class Attempt:
         self._place = folder.attempts / f'{job.cell}.{secrets.token_hex(4)}'
         self._log = self._place.with_name(f'{self._place.name}.log')
         self._began = time.monotonic()
-        command = [sys.executable, '-m', 'codetr_ros.cli', 'train', '--in-process']
+        command = [sys.executable, '-m', 'codetr_ros.cli', 'train', '--in-process', '--no-bag']
         command += ['--config', str(folder.settings(job.cell)), '--out', str(self._place)]
         with self._log.open('wb') as log:
             log.write(f'$ {shlex.join(command)}\n'.encode())

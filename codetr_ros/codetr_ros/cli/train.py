@@ -6,7 +6,6 @@ import re
 import secrets
 import shlex
 import time
-import traceback
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from functools import partial
@@ -14,10 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from codetr_ros import config
-from codetr_ros.cli import FAILED, INTERRUPTED, refuse, results
+from codetr_ros.cli import FAILED, INTERRUPTED, refuse, results, resume, train_in_process
 from codetr_ros.cli.audience import Audience
 from codetr_ros.cli.beside import Beside
 from codetr_ros.cli.flags import parse
+from codetr_ros.cli.outcome import Outcome
 from codetr_ros.cli.terminal import console
 from codetr_ros.cli.train_flags import FLAGS, PEER_DEADLINE, wrong
 from codetr_ros.config import Settings, SettingsError
@@ -27,15 +27,16 @@ from codetr_ros.processes.openmp import crowded, threading_environment
 from codetr_ros.processes.supervise import Interrupts, Silence, supervise, why_it_gave_up
 from codetr_ros.records import Record
 from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs import origin
 from codetr_ros.runs import reports as node_reports
 from codetr_ros.runs.folder import RunFolderError
-from codetr_ros.runs.live import Live, State
+from codetr_ros.runs.live import Live
 from codetr_ros.runs.middle import Middle
+from codetr_ros.runs.origin import Origin, held
 from codetr_ros.runs.progress import Progress
 from codetr_ros.runs.reports import NodeReport
 from codetr_ros.runs.summary import Summary
 from codetr_ros.runs.tensorboard import Events
-from codetr_ros.system.files import atomic_write
 
 if TYPE_CHECKING:
     from codetr_ros.ros.watch import Watcher
@@ -79,23 +80,6 @@ class Shown:
     watch: bool = False
 
 
-@dataclasses.dataclass
-class Outcome:
-    """How a run ended."""
-
-    reports: Mapping[str, NodeReport]
-    interrupted: bool = False
-    failure: str | None = None
-    log: Path | None = None  # explains the failure
-
-    @property
-    def state(self) -> State:
-        """How it ended, in a word."""
-        if self.failure:
-            return 'failed'
-        return 'interrupted' if self.interrupted else 'finished'
-
-
 def main(arguments: Sequence[str], start: launcher.Start = launcher.start_program) -> int:
     """Train by the values of the command line; returns the exit code.
 
@@ -107,8 +91,11 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
     from codetr_ros.simulation import tasks
 
     try:
-        settings, extra = parse(arguments, 'codetr train', DESCRIPTION, 'quick', FLAGS)
-        in_process = extra['in_process']
+        given = resume.with_settings(arguments)
+        settings, extra = parse(given, 'codetr train', DESCRIPTION, 'quick', FLAGS)
+        folder: Path | None = extra['resume']
+        begun = None if folder is None else resume.check(folder, settings, extra)
+        in_process = extra['in_process'] if begun is None else begun.in_process
         if settings.method in config.IN_PROCESS_ONLY and not in_process:
             return refuse(
                 f'--method {settings.method} {config.IN_PROCESS_ONLY[settings.method]}: '
@@ -121,7 +108,7 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
         if not in_process:
             for role in settings.roles:
                 launcher.executable(role)
-        if reason := wrong(extra):
+        if begun is None and (reason := wrong(extra)):
             return refuse(reason)
         stamp = time.strftime('%Y%m%d-%H%M%S')
         out = Path(extra['out'] or default_out(settings, stamp))
@@ -132,7 +119,8 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
         else:
             _watcher(settings)
             tryout.apart(settings, launcher.environment(settings))
-        folder = run_folder.create(out) if extra['out'] else run_folder.create_next(out)
+        if folder is None:
+            folder = run_folder.create(out) if extra['out'] else run_folder.create_next(out)
     except (
         SettingsError,
         tasks.TaskError,
@@ -143,10 +131,17 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
         return refuse(str(error))
     # A letter first: as a ROS parameter and in a namespace it must not read as a number.
     run_id = f'r{stamp.replace("-", "_")}_{secrets.token_hex(2)}'
-    topics = None if in_process else Topics(extra['namespace'], extra['peer_deadline'], start)
+    namespace = extra['namespace']
+    if begun is not None:
+        run_id, namespace = begun.run_id, begun.namespace
+    topics = None if in_process else Topics(namespace, extra['peer_deadline'], start)
     command = shlex.join(['codetr', 'train', *arguments])
     shown = Shown(extra['film'], extra['tensorboard'], extra['watch'])
-    return train(settings, run_id, folder, topics, command, shown)
+    try:
+        with held(folder):
+            return train(settings, run_id, folder, topics, command, shown, extra['bag'], begun)
+    except RunFolderError as error:
+        return refuse(str(error))
 
 
 def default_out(settings: Settings, stamp: str) -> str:
@@ -162,8 +157,10 @@ def train(
     topics: Topics | None = None,
     command: str | None = None,
     shown: Shown = Shown(),
+    bag: bool = True,
+    begun: Origin | None = None,
 ) -> int:
-    """Do a run and write everything about it into its folder.
+    """Do a run, or go on with one, and write everything about it into its folder.
 
     Args:
         settings: the run's settings.
@@ -172,25 +169,41 @@ def train(
         topics: how the nodes are started; None: run in process, without any.
         command: the command line, for the summary.
         shown: what people see of it.
+        bag: record it, if it runs in process.
+        begun: how the run began that is gone on with; None: it begins now.
 
     Returns:
         The exit code: 0 finished, 1 failed, 2 refused, 130 interrupted.
     """
     settings = config.settled(settings)
+    in_process = topics is None
+    namespace = None if topics is None else topics.namespace or launcher.namespace_of(run_id)
+    notes: list[str] = []
     try:
-        run_folder.write_settings(folder, settings)
+        if begun is not None:
+            notes = resume.begin(folder, begun, settings)
+        else:
+            run_folder.write_settings(folder, settings)
+            where = namespace or launcher.namespace_of(run_id)
+            recorded = bag or not in_process
+            origin.write(
+                folder, origin.origin(settings, run_id, where, in_process, recorded, command)
+            )
     except OSError as error:
         return refuse(str(error))
-    summary = Summary(settings, run_id, topics is None, command=command)
+    recorded_before = True if begun is not None else None
+    summary = Summary(settings, run_id, in_process, command=command, recorded=recorded_before)
     progress = Progress(settings)
-    namespace = None if topics is None else topics.namespace or launcher.namespace_of(run_id)
     live = Live(folder, summary, progress, namespace)
     progress.log(
         f'{settings.task}: {settings.composite} of {config.delay_in_words(settings.delay)}, '
         f'method {settings.method}, {settings.steps} steps, seed {settings.seed}'
         + (', in process' if topics is None else '')
+        + (', gone on with' if begun is not None else '')
     )
     progress.log(f'output: {results.short(folder)}')
+    for note in notes:
+        progress.log(note)
     if reason := crowded(settings.thread_count, os.getloadavg()[0]):
         progress.log(reason)
     if namespace is not None:
@@ -203,12 +216,21 @@ def train(
     audience = Audience(summary, progress, live, events, page, middle)
     with Interrupts() as interrupts, page or nullcontext():
         with progress:
-            way = _in_process if topics is None else partial(_over_topics, topics)
+            way = (
+                partial(train_in_process.run, bag=bag, resumed=begun is not None)
+                if topics is None
+                else partial(_over_topics, topics)
+            )
             outcome = way(settings, run_id, folder, audience, interrupts)
+        if outcome.refused:
+            return refuse(outcome.refused)
         live.end('ending')
-        bag = folder / run_folder.BAG
+        place = folder / run_folder.BAG
         built = summary.build(
-            outcome.reports, bag if bag.is_dir() else None, outcome.interrupted, outcome.failure
+            outcome.reports,
+            place if place.is_dir() else None,
+            outcome.interrupted,
+            outcome.failure,
         )
         try:
             audience.end()
@@ -225,41 +247,6 @@ def train(
     if outcome.interrupted:
         return INTERRUPTED
     return FAILED if outcome.failure else 0
-
-
-def _in_process(
-    settings: Settings,
-    run_id: str,
-    folder: Path,
-    audience: Audience,
-    interrupts: Interrupts,
-) -> Outcome:
-    os.environ.update(threading_environment(settings))
-    from codetr_ros.cores import in_process
-
-    def tick() -> None:
-        if interrupts.count:
-            raise KeyboardInterrupt
-        audience.tick()
-
-    # A slice may be long: a second Ctrl-C does not wait for its end.
-    interrupts.raising = True
-    try:
-        reports = in_process.run(
-            settings, run_id, folder, audience.receive, tick, audience.live.attend
-        )
-        return Outcome(reports)
-    except KeyboardInterrupt:
-        audience.progress.log('stopped')
-        return Outcome(node_reports.read_all(folder), interrupted=True)
-    except Exception as error:  # noqa: BLE001
-        # The summary keeps what was learnt until now, and names the failure, whatever it is.
-        log = folder / run_folder.LOGS / 'in_process.log'
-        atomic_write(log, traceback.format_exc())
-        reports = node_reports.read_all(folder)
-        return Outcome(reports, failure=f'{type(error).__name__}: {error}', log=log)
-    finally:
-        interrupts.raising = False
 
 
 def _watcher(settings: Settings) -> 'type[Watcher]':

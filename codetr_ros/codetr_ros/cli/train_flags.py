@@ -1,6 +1,7 @@
 """The flags of `codetr train` that are no settings of the run."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
@@ -59,6 +60,29 @@ FLAGS: Sequence[tuple[str, Any, Any]] = [
         False,
     ),
     (
+        'bag',
+        Annotated[
+            bool,
+            tyro.conf.arg(
+                help='record a run in process; nodes always do. Without its bag a run cannot be '
+                'gone on with'
+            ),
+        ],
+        True,
+    ),
+    (
+        'resume',
+        Annotated[
+            Path | None,
+            tyro.conf.arg(
+                metavar='DIR',
+                help='go on with the run in this folder where it ended or was killed, with its '
+                'settings; with more --steps a finished one too',
+            ),
+        ],
+        None,
+    ),
+    (
         'tensorboard',
         Annotated[
             bool, tyro.conf.arg(help='write events for TensorBoard into the folder tensorboard')
@@ -73,6 +97,8 @@ FLAGS: Sequence[tuple[str, Any, Any]] = [
 def wrong(extra: Mapping[str, Any]) -> str | None:
     """Why flags that are no settings cannot be used; None if they can."""
     namespace = extra['namespace']
+    if not extra['bag'] and not extra['in_process']:
+        return '--no-bag is for --in-process: nodes go on after a fault only with a bag'
     if namespace is not None and extra['in_process']:
         return '--namespace is for nodes, and --in-process starts none: leave out one of them'
     if namespace is not None and (reason := middleware.wrong_namespace(namespace)):

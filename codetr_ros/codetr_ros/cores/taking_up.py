@@ -23,7 +23,7 @@ from codetr_ros.bags.reopening import reopen
 from codetr_ros.config import Settings, from_canonical, settled
 from codetr_ros.cores import going_on
 from codetr_ros.cores.consumer import Consumer
-from codetr_ros.cores.in_process import Attend, Parts, driven, namespace_of
+from codetr_ros.cores.in_process import Parts, driven, namespace_of
 from codetr_ros.cores.recording import RunBag
 from codetr_ros.records import (
     Commit,
@@ -46,16 +46,16 @@ from codetr_ros.runs.reports import NodeReport
 _log = logging.getLogger(__name__)
 
 
-def take_up(
+def prepare(
     settings: Settings,
     run_id: str,
     folder: Path,
     observe: Callable[[Record], None] = lambda record: None,
     tick: Callable[[], None] = lambda: None,
-    attend: Attend = lambda cores: None,
+    past: Callable[[Record], None] = lambda record: None,
     log: Callable[[str], None] = _log.warning,
-) -> dict[str, NodeReport]:
-    """Go on with a run in process to its end.
+) -> Parts:
+    """Bring the parts of a run in process to where they were: `in_process.driven` goes on.
 
     Args:
         settings: the run's settings; only `steps` may be others than before, and more.
@@ -63,14 +63,12 @@ def take_up(
         folder: its folder, with its bag and checkpoints.
         observe: called with every record that the bag does not hold yet.
         tick: as for `in_process.run`.
-        attend: as for `in_process.run`.
+        past: called with every record that the bag holds.
         log: takes what people should know, a line at a time.
 
-    Returns:
-        A report for each part of the whole run.
-
     Raises:
-        BagError: the bag is damaged before its last commit, or cannot be written.
+        BagError: the bag is damaged before its last commit, of another run or of other settings,
+            or cannot be written.
         CheckpointError: the checkpoints are of another run, of other settings or of an older
             version.
         RecordError: the bag's records contradict each other.
@@ -84,9 +82,13 @@ def take_up(
     known = None if before is None else from_canonical(before.settings, str(bag))
     made = _cut(bag, known, settings, log)
     parts = Parts(settings, run_id, folder, observe, tick)
-    attend(parts.cores)
-    _Past(parts, folder, made, log).restore()
-    return driven(parts)
+    _Past(parts, folder, made, past, log).restore()
+    return parts
+
+
+def take_up(settings: Settings, run_id: str, folder: Path) -> dict[str, NodeReport]:
+    """Go on with a run in process to its end; the errors are those of `prepare`."""
+    return driven(prepare(settings, run_id, folder))
 
 
 def _check(before: RunSpec, settings: Settings, run_id: str, bag: Path) -> None:
@@ -136,13 +138,22 @@ class _Past:
         parts: those of the run that goes on.
         folder: of the run.
         made: what is left of its bag.
+        past: takes what the bag holds.
         log: takes what people should know.
     """
 
-    def __init__(self, parts: Parts, folder: Path, made: Cut, log: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        parts: Parts,
+        folder: Path,
+        made: Cut,
+        past: Callable[[Record], None],
+        log: Callable[[str], None],
+    ) -> None:
         self._parts = parts
         self._folder = folder
         self._commit = made.commit
+        self._past = past
         self._log = log
         self._known = 0  # the last phase of which all that was learnt lies before the commit
         self._policies: dict[int, Policy] = {}  # whose evaluation may be incomplete, by version
@@ -217,6 +228,7 @@ class _Past:
             return
         record, parts = decode(kind, message.data), self._parts
         parts.count(self._publisher(record), record)
+        self._past(record)
         parts.recorder.restore(record)
         for simulator in parts.simulators.values():
             simulator.restore(record)

@@ -10,6 +10,7 @@ from codetr_ros import config
 from codetr_ros.system.files import FileError, atomic_write, check_makeable, check_writable
 
 CONFIG = 'config.yaml'
+ORIGIN = 'run.json'
 BAG = 'bag'
 CHECKPOINTS = 'checkpoints'
 NODES = 'nodes'

@@ -71,6 +71,11 @@ class Progress(Display):
             self.tick()
         return self
 
+    def go_on(self) -> None:
+        """Note that all received so far is of an earlier time: speed is measured from here."""
+        self._marks.clear()
+        self._marks.append((self._clock(), self.steps))
+
     def receive(self, record: Record) -> None:
         """Note a record of the run."""
         if isinstance(record, Commit):

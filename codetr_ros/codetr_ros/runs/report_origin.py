@@ -21,6 +21,7 @@ from codetr_ros.runs.run_summary import RunSummary
 
 FILES = (
     (run_folder.CONFIG, 'every setting; codetr train --config repeats the run with it'),
+    (run_folder.ORIGIN, 'how and where the run was begun'),
     (run_folder.BAG, 'the recording: every step, score, label, policy and result'),
     (run_folder.SUMMARY, 'the run for programs'),
     (run_folder.METRICS, 'a row for each phase: returns, losses, times'),

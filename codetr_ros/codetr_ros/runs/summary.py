@@ -84,6 +84,7 @@ class Summary:
         in_process: whether it ran without topics.
         clock: seconds, never going back; the time of the run begins now.
         command: the command that started it; None if nodes were started one by one.
+        recorded: labels come from the run's bag, at least for a part of the run.
     """
 
     def __init__(
@@ -93,6 +94,7 @@ class Summary:
         in_process: bool,
         clock: Callable[[], float] = time.monotonic,
         command: str | None = None,
+        recorded: bool | None = None,
     ) -> None:
         self.settings = settings
         self.run_id = run_id
@@ -106,7 +108,8 @@ class Summary:
         self._training: dict[int, _Results] = {}  # by phase
         self._metrics: dict[int, dict[tuple[str, str, str], float]] = defaultdict(dict)  # by phase
         self._phases = 0
-        self._recovery = Recovery(settings, recorded=not in_process)
+        self._before = 0  # steps of the run before its time began
+        self._recovery = Recovery(settings, not in_process if recorded is None else recorded)
         self._wall: float | None = None  # seconds that the run took, once it is over
 
     def receive(self, record: Record) -> None:
@@ -149,6 +152,10 @@ class Summary:
     def wall_s(self) -> float:
         """Seconds that the run has taken, the start of its processes included."""
         return self._clock() - self._began if self._wall is None else self._wall
+
+    def go_on(self) -> None:
+        """Note that all received so far is of an earlier time: the run goes on from here."""
+        self._before = self.steps
 
     def end(self, wall_s: float | None = None) -> None:
         """End the time of the run; records may still come.
@@ -245,7 +252,7 @@ class Summary:
             phases=self.phases,
             phases_planned=settings.phases,
             wall_s=round(wall, 3),
-            steps_per_s=round(self.steps / wall, 3) if wall > 0 else None,
+            steps_per_s=round((self.steps - self._before) / wall, 3) if wall > 0 else None,
             evaluations=evaluations,
             random=random,
             reward_recovery=self._reward_recovery(),

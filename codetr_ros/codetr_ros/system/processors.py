@@ -1,6 +1,7 @@
 """The processors that this process may use."""
 
 import os
+import platform
 from pathlib import Path
 
 CONTROL_GROUPS = Path('/sys/fs/cgroup')
@@ -30,6 +31,20 @@ def quota(groups: Path = CONTROL_GROUPS) -> float | None:
         if len(words) == 2 and all(word.isdecimal() for word in words) and int(words[1]):
             return int(words[0]) / int(words[1])
     return None
+
+
+def model(information: Path = Path('/proc/cpuinfo')) -> str:
+    """What the processor calls itself; the kind of machine where it does not.
+
+    Args:
+        information: where Linux shows it.
+    """
+    if information.is_file():
+        for line in information.read_text(errors='replace').splitlines():
+            name, _, value = line.partition(':')
+            if name.strip() == 'model name' and value.strip():
+                return value.strip()
+    return platform.machine()
 
 
 def _words(path: Path) -> list[str]:

@@ -1,0 +1,131 @@
+"""`codetr train --resume`: which run is gone on with, and whether it can be."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from codetr_ros import config
+from codetr_ros.config import Settings
+from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs import origin, run_summary
+from codetr_ros.runs.folder import RunFolderError
+from codetr_ros.runs.origin import Origin
+from codetr_ros.system.versions import version_of
+
+FLAG = '--resume'
+MAY_CHANGE = ('steps',)
+"""Settings that may be others when a run goes on."""
+OF_NEW_RUNS = {'out': None, 'namespace': None, 'in_process': False, 'bag': True}
+"""Flags that decide how a run begins, each with its default: a run goes on as it began."""
+
+
+def with_settings(arguments: Sequence[str]) -> list[str]:
+    """The arguments of `codetr train`, with the settings of the run that is gone on with as their
+    defaults, if there is one.
+
+    Raises:
+        RunFolderError: `--resume` names no folder of a run, or comes with `--config`.
+    """
+    folder = None
+    for i, argument in enumerate(arguments):
+        if argument == FLAG:
+            folder = arguments[i + 1] if i + 1 < len(arguments) else ''
+        elif argument.startswith(f'{FLAG}='):
+            folder = argument.removeprefix(f'{FLAG}=')
+    if folder is None:
+        return list(arguments)
+    if not folder:
+        raise RunFolderError(f'{FLAG} needs the folder of a run')
+    if any(argument.partition('=')[0] == '--config' for argument in arguments):
+        raise RunFolderError(
+            f'{FLAG} {folder} goes on with the settings of the run: leave out --config'
+        )
+    run_folder.read_settings(Path(folder))  # refuses what is no folder of a run
+    return [*arguments, '--config', str(Path(folder) / run_folder.CONFIG)]
+
+
+def check(folder: Path, settings: Settings, extra: Mapping[str, Any]) -> Origin:
+    """Check that a run can be gone on with under these settings.
+
+    Args:
+        folder: of the run.
+        settings: by the command line.
+        extra: the flags that are no settings.
+
+    Returns:
+        How the run was begun.
+
+    Raises:
+        RunFolderError: it cannot: names the reason and the remedy.
+        SettingsError: its own settings cannot be read.
+    """
+    before = run_folder.read_settings(folder)
+    made = origin.read(folder)
+    for name, default in OF_NEW_RUNS.items():
+        if extra[name] != default:
+            flag = name.replace('_', '-')
+            raise RunFolderError(
+                f'{FLAG} goes on with a run as it began: leave out --{flag}'.replace(
+                    '--bag', '--no-bag'
+                )
+            )
+    if not made.recorded:
+        raise RunFolderError(
+            f'the run in {folder} was made with --no-bag: without a bag there is nothing to go on '
+            'from. Start it again'
+        )
+    mine = version_of('codetr_ros')
+    if made.versions.get('codetr_ros') != mine:
+        raise RunFolderError(
+            f'the run in {folder} was begun with codetr_ros {made.versions.get("codetr_ros")}, '
+            f'this is {mine}: go on with the version that began it, or start the run again'
+        )
+    _check_settings(folder, before, settings)
+    if _finished(folder, settings):
+        raise RunFolderError(
+            f'the run in {folder} has finished its {before.steps} steps: give more, with '
+            f'{FLAG} {folder} --steps N'
+        )
+    return made
+
+
+def _check_settings(folder: Path, before: Settings, settings: Settings) -> None:
+    ours, theirs = settings.flat(), before.flat()
+    changed = [name for name in ours if ours[name] != theirs[name] and name not in MAY_CHANGE]
+    if changed:
+        shown = ', '.join(f'{name} = {theirs[name]!r} (now {ours[name]!r})' for name in changed)
+        raise RunFolderError(
+            f'the run in {folder} has {shown}: a run goes on with the settings that it began '
+            f'with, only {", ".join(MAY_CHANGE)} may change. Leave them out, or start a new run'
+        )
+    if settings.steps < before.steps:
+        raise RunFolderError(
+            f'--steps {settings.steps}: the run in {folder} has {before.steps}, and can only get '
+            'longer'
+        )
+
+
+def _finished(folder: Path, settings: Settings) -> bool:
+    path = folder / run_folder.SUMMARY
+    if not path.is_file():
+        return False
+    summary = run_summary.read(path)
+    over = not summary.interrupted and summary.failure is None
+    return over and summary.steps >= settings.steps
+
+
+def begin(folder: Path, made: Origin, settings: Settings) -> list[str]:
+    """Note that a run goes on; what people should know of this machine.
+
+    Args:
+        folder: of the run.
+        made: how it was begun.
+        settings: under which it goes on.
+    """
+    settings = config.settled(settings)
+    run_folder.write_settings(folder, settings)
+    origin.gone_on_with(folder, made)
+    other = origin.differences(made, settings)
+    if not other:
+        return []
+    return [f'the run was begun with {"; ".join(other)}: the last bits of weights may differ']
