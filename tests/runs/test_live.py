@@ -280,3 +280,21 @@ def test_what_waits_for_labels_has_a_bound():
             newest.receive(record)
     assert len(newest._held) == MOST_HELD
     assert newest.document()['episode'] == 2 * MOST_HELD - 1
+
+
+def test_the_table_of_a_run_that_goes_on_keeps_what_it_had(tmp_path: Path):
+    records = a_run()
+    whole = Summary(SETTINGS, 'r', in_process=True)
+    for record in records:
+        whole.receive(record)
+    for part in (records[:5], records[5:]):
+        clock = Clock()
+        summary = Summary(SETTINGS, 'r', in_process=True, clock=clock)
+        progress = Progress(SETTINGS, io.StringIO(), live=False)
+        live = Live(tmp_path, summary, progress, clock=clock)
+        for record in part:
+            summary.receive(record)
+            live.receive(record)
+        clock.now += 2
+        live.tick()
+    assert (tmp_path / 'metrics.csv').read_text() == whole.metrics_csv()

@@ -85,9 +85,11 @@ class RunSource:
         table = self._folder / run_folder.METRICS
         if self._changed(table):
             self._read_table(table)
-        if self._changed(self._folder / run_folder.EPISODE):
+        episode = self._folder / run_folder.EPISODE
+        if self._changed(episode):
             self._publish_episode(self._read(run_folder.EPISODE))
-        self._follow_bag(with_tables=not table.is_file())
+        if not (episode.is_file() and table.is_file()):  # the bag has nothing newer
+            self._follow_bag(with_tables=not table.is_file())
         self._feed.publish('status', self._status_now())
         self._feed.publish('pictures', self._pictures())
         self._feed.publish('notes', list(self._notes.values()))

@@ -1,6 +1,7 @@
 """The course of a run: the numbers of its `metrics.csv` over training."""
 
 import csv
+import io
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -44,6 +45,28 @@ def parse(lines: Iterable[str]) -> dict[str, Points]:
             if value:
                 columns.setdefault(name, []).append((step, float(value)))
     return dict(columns)
+
+
+def joined(before: str, now: str) -> str:
+    """The table of a run that goes on: what it was before, and what has come since.
+
+    Args:
+        before: the table as it was; empty if there was none.
+        now: the table since; its cells replace those of the same phase.
+    """
+    rows: dict[str, dict[str, str]] = {}
+    for table in (before, now):
+        for row in csv.DictReader(io.StringIO(table)):
+            known = rows.setdefault(row['phase'], {})
+            known |= {name: cell for name, cell in row.items() if cell}
+    first = ('step', 'phase')
+    columns = sorted({name for row in rows.values() for name in row} - set(first))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, [*first, *columns], restval='', lineterminator='\n')
+    writer.writeheader()
+    for _, row in sorted(rows.items(), key=lambda item: int(item[0] or -1)):
+        writer.writerow(row)
+    return text.getvalue()
 
 
 def losses(columns: Mapping[str, Points]) -> dict[str, Points]:

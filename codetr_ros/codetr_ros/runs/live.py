@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from codetr_ros.records import Commit, EpisodeResult, Metrics, Presence, Record
+from codetr_ros.runs import course
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.newest_episode import NewestEpisode
 from codetr_ros.runs.progress import Progress
@@ -71,6 +72,9 @@ class Live:
         self._episode = NewestEpisode() if summary.in_process else None
         self._shown = 0  # changes of the episode that were written
         self._broken = False
+        # of a run that goes on: its summary has what comes from now on
+        table = folder / run_folder.METRICS
+        self._before = table.read_text() if table.is_file() else ''
         self.seconds = 0.0
         """Spent on writing."""
 
@@ -120,7 +124,10 @@ class Live:
         try:
             self._put(run_folder.STATUS, json.dumps(self.status(state, failure), indent=1))
             if self._changed:
-                self._put(run_folder.METRICS, self._summary.metrics_csv())
+                table = self._summary.metrics_csv()
+                if self._before:
+                    table = course.joined(self._before, table)
+                self._put(run_folder.METRICS, table)
                 self._changed = False
             if self._episode is not None and self._episode.changes != self._shown:
                 self._shown = self._episode.changes

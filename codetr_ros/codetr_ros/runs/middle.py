@@ -22,8 +22,9 @@ class Middle:
         self._folder = folder
         self._log = log
         self._phase = settings.phases // 2 - 1
-        if self._phase < max(0, settings.warmup_phases - 1):
-            self._phase = settings.phases  # never: the policy has learnt nothing by then
+        kept = (folder / run_folder.MIDDLE).exists()  # of a run that goes on
+        if kept or self._phase < max(0, settings.warmup_phases - 1):
+            self._phase = settings.phases  # never: else the policy has learnt nothing by then
 
     def look(self, committed: int) -> None:
         """Keep the policy if the run has come so far. Call it now and then.
@@ -45,4 +46,4 @@ class Middle:
             return  # it was replaced by a newer one just now
         except OSError as error:
             self._log(f'the report will not show the policy of the middle of the run: {error}')
-        self._phase = 2**63
+        self._phase = 2**63  # never again
