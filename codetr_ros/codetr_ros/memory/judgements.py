@@ -6,6 +6,7 @@ brings their scores to one scale and gives each segment one score, the weighted 
 scorer that is its own score, to the bit.
 """
 
+import hashlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -34,6 +35,12 @@ class Pairs:
 
     def __len__(self) -> int:
         return len(self.outcomes)
+
+    def digest(self) -> int:
+        """A number by which other preferences are told from these."""
+        arrays = (self.first, self.second, self.outcomes)
+        digest = hashlib.sha256(b''.join(each.tobytes() for each in arrays)).digest()
+        return int.from_bytes(digest[:8], 'little', signed=True)
 
 
 @dataclass(frozen=True)
@@ -69,6 +76,7 @@ class Judgements:
         )
         self._scorers: set[str] = set()  # that have stated anything
         self._scales: tuple[list[str], Scales] | None = None
+        self._pairs: Pairs | None = None
         self.counts: Counter[str] = Counter()
         """Corrections, and judgements that state that their scorer cannot tell."""
 
@@ -86,6 +94,7 @@ class Judgements:
         else:
             self._score(judgement)
         self._scorers.add(judgement.scorer)
+        self._pairs = None
 
     def _score(self, reward: CompositeReward) -> None:
         place = self._segments.place(
@@ -116,6 +125,7 @@ class Judgements:
 
     def forget_evicted(self) -> None:
         """Drop what is of segments that the memory no longer holds."""
+        self._pairs = None
         held = self._segments.holds
         self._scores = {place: of for place, of in self._scores.items() if held(place)}
         self._preferences = {
@@ -131,6 +141,7 @@ class Judgements:
             predict: what the reward model expects, by which the scales of scorers that share few
                 segments are told from what they scored; None: it knows nothing yet.
         """
+        self._pairs = None  # ids change with the sources
         flat = list(self._flat())
         names = sorted({name for _, name, _ in flat})
         values = dict.fromkeys(self._scores, np.nan)
@@ -175,12 +186,14 @@ class Judgements:
 
     def pairs(self) -> Pairs:
         """The preferences that are held, by scorer and segments."""
-        known = [(k, o) for k, o in sorted(self._preferences.items()) if not np.isnan(o)]
-        return Pairs(
-            self._segments.ids_of([key[1] for key, _ in known]),
-            self._segments.ids_of([key[2] for key, _ in known]),
-            np.array([outcome for _, outcome in known], np.float64),
-        )
+        if self._pairs is None:
+            known = [(k, o) for k, o in sorted(self._preferences.items()) if not np.isnan(o)]
+            self._pairs = Pairs(
+                self._segments.ids_of([key[1] for key, _ in known]),
+                self._segments.ids_of([key[2] for key, _ in known]),
+                np.array([outcome for _, outcome in known], np.float64),
+            )
+        return self._pairs
 
     def judged(self) -> I64:
         """Ids of the segments of which somebody has stated anything, ascending."""

@@ -98,6 +98,11 @@ class Codetr(SequenceMethod):
             error = F.mse_loss(predicted, self._scaled(part.values), reduction='sum')
             yield {'reward_loss': error / len(batch.values)}
 
+    def _predicted(self, batch: SegmentBatch) -> Tensor:
+        weights, rewards = self.network(*self._inputs(batch))  # (B, L) each
+        predicted: Tensor = (weights * rewards * self._put(segment_steps(batch))).sum(1)
+        return predicted
+
     def _read_off(self, observations: Tensor, actions: Tensor, inside: Tensor) -> Tensor:
         """Step rewards; with `label` 'product' they sum to a segment's predicted score."""
         weights, rewards = self.network(observations, actions, inside)

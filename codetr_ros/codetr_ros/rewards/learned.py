@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from codetr_ros.config import CodetrSettings, PerceptronSettings, Settings
 from codetr_ros.memory.batches import SegmentBatch
@@ -30,6 +31,13 @@ CLIP = 10.0
 A component that hardly moved in the warm-up may later lie a thousand of its deviations away.
 """
 
+PAIRS = 32
+"""Preferences in a gradient step (decided here)."""
+TEMPERATURE = 1.0
+"""Difference of two segments' levels, in units of c, at which the better one is preferred with
+odds of e (decided here).
+"""
+
 
 class Learned(Predictor):
     """A method that fits a network to composite rewards by gradient steps.
@@ -38,6 +46,11 @@ class Learned(Predictor):
     reward per step of the warm-up: a positive constant, never a shift, so that the worth of
     survival keeps its sign. The network sees observations standardised by the moments of the
     warm-up.
+
+    Preferences between two segments are learnt by the model of Bradley and Terry (1952), as in
+    Christiano et al. (2017): the odds of the better one are exp of the difference of their levels,
+    which are predicted scores per step of the longest segment. Their loss is added to that of
+    scores: docs/methods.md#preferences.
 
     A subclass defines its network, the terms of its loss, and the step rewards that it reads off.
 
@@ -50,6 +63,7 @@ class Learned(Predictor):
 
     group: ClassVar[str]
     """The group of settings by which it is trained."""
+    uses_preferences: ClassVar[bool] = True
     clip: ClassVar[float] = math.inf
     """Deviations from the mean beyond which standardised observations are cut off.
 
@@ -92,6 +106,35 @@ class Learned(Predictor):
     ) -> Iterator[dict[str, Tensor]]:
         """The loss of one batch, part by part: scalars by name, whose total is minimised."""
 
+    def _all_terms(
+        self, memory: Trajectories, rng: np.random.Generator
+    ) -> Iterator[dict[str, Tensor]]:
+        """Those of scores and of preferences, as far as there are any."""
+        if len(memory.segments.ids()):
+            yield from self._terms(memory, rng)
+        yield from self._preference_terms(memory, rng)
+
+    def _preference_terms(
+        self, memory: Trajectories, rng: np.random.Generator
+    ) -> Iterator[dict[str, Tensor]]:
+        """The loss of one batch of preferences."""
+        pairs = None if memory.judgements is None else memory.judgements.pairs()
+        if not pairs:
+            return
+        drawn = rng.integers(0, len(pairs), PAIRS)
+        first, second = (
+            self._predicted(memory.segments.batch(ids[drawn], self.context))
+            for ids in (pairs.first, pairs.second)
+        )
+        odds = (first - second) / (self._settings.longest * TEMPERATURE)  # logarithms of them
+        outcomes = self._put(pairs.outcomes[drawn].astype(np.float32))
+        yield {'preference_loss': F.binary_cross_entropy_with_logits(odds, outcomes)}
+
+    def _predicted(self, batch: SegmentBatch) -> Tensor:
+        """Predicted scores (B,) in units of c, with their gradient."""
+        inside = self._put(segment_steps(batch))
+        return (self._step_rewards(batch) * inside).sum(1)
+
     @abstractmethod
     def _step_rewards(self, batch: SegmentBatch) -> Tensor:
         """Step rewards (B, L) in units of c, of any value outside the segments."""
@@ -133,7 +176,7 @@ class Learned(Predictor):
         self.network.train()
         self._optimiser.zero_grad()
         metrics: dict[str, float] = {}
-        for terms in self._terms(memory, rng):
+        for terms in self._all_terms(memory, rng):
             torch.stack(list(terms.values())).sum().backward()  # type: ignore[no-untyped-call]
             # read only now: on a GPU, reading waits for the result
             for name, term in terms.items():

@@ -69,6 +69,11 @@ class CodetrOnEvidence(Codetr):
         super().__init__(settings, observation_size, action_size)
 
     @property
+    def uses_preferences(self) -> bool:  # type: ignore[override]
+        """Whether the regression does."""
+        return self._base.uses_preferences
+
+    @property
     def version(self) -> int:
         """Fits of the regression, and gradient steps whose outcome the gate lets in."""
         return self._base.version + self._let_in
@@ -115,6 +120,12 @@ class CodetrOnEvidence(Codetr):
                 'score_loss': self._squares(part, due, 0 * f, (weights * whole)[own]),
             }
             yield {name: value / len(drawn) for name, value in squares.items()}
+
+    def _preference_terms(
+        self, memory: Trajectories, rng: np.random.Generator
+    ) -> Iterator[dict[str, Tensor]]:
+        """None: the regression learns from preferences, the network from what it leaves."""
+        yield from ()
 
     def _squares(self, batch: SegmentBatch, due: F64, f: F64, u: Tensor) -> Tensor:
         """The sum of squares of due levels (b,) less those of the step rewards f + u (N,)."""

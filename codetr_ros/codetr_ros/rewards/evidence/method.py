@@ -15,7 +15,6 @@ is from our trial of the method and what is decided here.
 
 import copy
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -26,6 +25,7 @@ from torch import Tensor
 
 from codetr_ros.config import Settings
 from codetr_ros.memory.batches import SegmentBatch
+from codetr_ros.memory.judgements import Pairs
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import F32, F64, I64
 from codetr_ros.rewards.base import ModelFacts, Predictor, RewardModelError, segment_steps
@@ -35,8 +35,13 @@ from codetr_ros.rewards.evidence.features import PIECE, Features, step_inputs
 from codetr_ros.rewards.evidence.link import Link
 from codetr_ros.rewards.evidence.maxima import SoftMax
 from codetr_ros.rewards.evidence.model import Model, of_steps
+from codetr_ros.rewards.evidence.pairs import fit_pairs
 from codetr_ros.rewards.evidence.sample import Sample, Sampler, chosen
-from codetr_ros.rewards.evidence.uncertainty import deviations, level_covariance
+from codetr_ros.rewards.evidence.uncertainty import (
+    Uncertainty,
+    deviations,
+    level_covariance,
+)
 from codetr_ros.seeding import generator
 from codetr_ros.system.states import check_state
 
@@ -48,18 +53,6 @@ NEWEST, NEWEST_STEPS = 64, 1000
 """The newest segments, and their steps, of which metrics state how sure the fit is."""
 SHOWN = 5
 """Features in a summary: those with which the step reward changes most."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Uncertainty:
-    """How far step rewards may be off, one standard deviation, in the unit of labels.
-
-    Of f and of what a reward has beyond f; that a label also explains its segment's own score is
-    not taken off.
-    """
-
-    steps: F32  # (B, L) of each step's reward, 0 outside of the segments
-    segments: F64  # (B,) of the level of each segment's score, predicted from its steps alone
 
 
 class Evidence(Predictor):
@@ -113,15 +106,23 @@ class Evidence(Predictor):
         Raises:
             RewardModelError: the regression has failed on numbers that are too large.
         """
+        pairs = self._pairs(memory)
         all_ids = memory.segments.ids()
         scores = memory.segments.scores(all_ids)
-        seen = memory.segments.digest()
+        seen = memory.segments.digest() ^ (0 if pairs is None else pairs.digest())
         if self._fits and seen == self._seen:
+            return
+        if pairs is not None:
+            self._fit_pairs(memory, pairs)
+            self._seen = seen
             return
         anew = len(all_ids) >= 2 * self._begun_at
         choosing = anew and self._own.link == 'choose'
-        if self._ordinal:
-            self._require_few_values(scores)
+        ordinal = self._ordinal
+        if ordinal and memory.judgements is not None:  # one value so far, or scales of several
+            ordinal = 2 <= len(np.unique(scores)) <= saving.MOST_VALUES
+        elif ordinal:
+            saving.require_few_values(scores)
         steps = choosing or not all(model.link.linear for _, model in self._mixture)
         ids = self._ids(memory, all_ids, steps)
         moments = self._sampler.moments(memory, ids)
@@ -133,12 +134,12 @@ class Evidence(Predictor):
         some = np.sort(rng.permutation(len(ids))[: self._own.scale_scores])
         try:
             if choosing:
-                self._choose(sample, some)
+                self._choose(sample, some, ordinal)
             else:
                 self._model.measure(scores, memory.segments.lengths(all_ids))
-                self._model = self._fit(self._model, sample, some, anew)
+                self._model = self._fit(self._model, sample, some, anew, ordinal)
                 if self._second is not None:
-                    self._second = self._fit(self._second, sample, some, anew)
+                    self._second = self._fit(self._second, sample, some, anew, ordinal)
         except FloatingPointError as error:
             raise RewardModelError(
                 f'method {self.name!r}: the regression on {len(ids)} scores between '
@@ -152,6 +153,33 @@ class Evidence(Predictor):
         self._fits += 1
         self._look_back(memory, ids)
 
+    @property
+    def uses_preferences(self) -> bool:  # type: ignore[override]
+        """Whether the kind of score is known and linear in step rewards."""
+        return self._own.link != 'choose' and self._model.link.linear
+
+    def _pairs(self, memory: Trajectories) -> Pairs | None:
+        """The preferences to learn from; None where there are none, or none can be used."""
+        if memory.judgements is None or not self.uses_preferences:
+            return None
+        return memory.judgements.pairs() or None
+
+    def _fit_pairs(self, memory: Trajectories, pairs: Pairs) -> None:
+        scores = len(memory.segments.ids())
+        if scores and self._model.scale == 1.0:  # that of preferences alone, which have no unit
+            self._model = self._new_model()
+        how = (self._features, self._sampler, memory, pairs, self._settings, self._fits)
+        try:
+            seen = fit_pairs(self._model, *how)
+        except FloatingPointError as error:
+            raise RewardModelError(
+                f'method {self.name!r}: the regression on {scores} scores and {len(pairs)} '
+                f'preferences has failed, {error}. Look for scores that are far off the others'
+            ) from None
+        self.target_scale = self._model.scale if self._settings.target_scale == 'rms' else 1.0
+        self._fits += 1
+        self._look_back(memory, seen)
+
     def _look_back(self, memory: Trajectories, ids: I64) -> None:
         """How sure the fit is of what came last: of a bounded number of steps."""
         newest = ids[-NEWEST:]
@@ -162,16 +190,6 @@ class Evidence(Predictor):
         self._step_sd = float(found.steps[segment_steps(batch)].mean())
         self._segment_sd = float(found.segments.mean())
 
-    def _require_few_values(self, scores: F64) -> None:
-        values = np.unique(scores)
-        if not 2 <= len(values) <= saving.MOST_VALUES:
-            shown = ', '.join(f'{value:g}' for value in values[:3])
-            raise RewardModelError(
-                f'evidence.score_scale = ordinal: the {len(scores)} scores have {len(values)} '
-                f'different values ({shown}, ...), an ordinal scale has 2 to '
-                f'{saving.MOST_VALUES}. Set evidence.score_scale to numbers'
-            )
-
     def _ids(self, memory: Trajectories, ids: I64, steps: bool) -> I64:
         """Segments to learn from: a bounded number, and of bounded steps if these are kept."""
         most = self._own.scores
@@ -180,21 +198,21 @@ class Evidence(Predictor):
             most = min(most, max(2, int(self._own.steps / mean)))
         return chosen(ids, most, self._settings.seed)
 
-    def _fit(self, before: Model, sample: Sample, some: I64, anew: bool) -> Model:
+    def _fit(self, before: Model, sample: Sample, some: I64, anew: bool, ordinal: bool) -> Model:
         """Go on from the last fit, and where `anew` begin anew beside it: the likelier one stays.
 
         Where F is not linear, a fit to few scores may lead to a place that later fits never leave.
         """
         fresh = Model(copy.copy(before.link), before.blocks)
         again = anew and before.fitted and not before.link.linear
-        before.fit(sample, some, self._ordinal)
+        before.fit(sample, some, ordinal)
         if again:
             fresh.scale = before.scale
-            fresh.fit(sample, some, self._ordinal)
+            fresh.fit(sample, some, ordinal)
         return fresh if again and fresh.evidence > before.evidence else before
 
-    def _choose(self, sample: Sample, some: I64) -> None:
-        choice = choose(sample, some, self._features.blocks, self._ordinal)
+    def _choose(self, sample: Sample, some: I64, ordinal: bool) -> None:
+        choice = choose(sample, some, self._features.blocks, ordinal)
         best, second = choice.order[:2]
         self._model = choice.models[best]
         close = choice.probabilities[second] > CLOSE * choice.probabilities[best]

@@ -17,11 +17,19 @@ import torch
 from torch import Tensor
 
 from codetr_ros.records import F64, I64
+from codetr_ros.rewards.evidence import duels as comparisons
 from codetr_ros.rewards.evidence import scales
+from codetr_ros.rewards.evidence.duels import Duels
 from codetr_ros.rewards.evidence.link import Link, level_scale
 from codetr_ros.rewards.evidence.maxima import SoftMax
-from codetr_ros.rewards.evidence.regression import Posterior, noise, posterior, prior_variances
-from codetr_ros.rewards.evidence.sample import Sample
+from codetr_ros.rewards.evidence.regression import (
+    Posterior,
+    from_others,
+    noise,
+    posterior,
+    prior_variances,
+)
+from codetr_ros.rewards.evidence.sample import Sample, gathered
 from codetr_ros.rewards.evidence.scales import Evidence, Linear
 from codetr_ros.rewards.evidence.verdicts import Verdicts
 
@@ -96,6 +104,8 @@ class Model:
         Raises:
             FloatingPointError: they are too large for float64.
         """
+        if not self.scale and not len(scores):  # preferences alone: their levels have no unit
+            self.scale = 1.0
         if not self.scale:
             with np.errstate(over='ignore'):
                 scale = level_scale(self.link.level(scores, m))
@@ -104,25 +114,60 @@ class Model:
             self.scale = scale
             self.link.measure(scale)
 
-    def fit(self, sample: Sample, some: I64, ordinal: bool = False) -> None:
+    def fit(
+        self, sample: Sample, some: I64, ordinal: bool = False, duels: Duels | None = None
+    ) -> None:
         """Learn from segments.
 
         Args:
             sample: the segments; with the features of steps, unless the link is linear.
             some: places of those from which the scales are learnt.
             ordinal: only the order of scores means anything.
+            duels: preferences between segments, where the link is linear.
 
         Raises:
             FloatingPointError: numbers are too large for float64.
         """
         self.measure(sample.scores, sample.m)
         levels = self.link.level(sample.scores, sample.m) / self.scale
+        if duels is not None:
+            self._fit_duels(sample, levels, some, duels)
+            return
         if ordinal:
             self._fit_verdicts(sample, levels, some)
             return
+        self.verdicts = None
         self._fit(sample, Targets(levels), some)
         slopes = self.link.log_slope(sample.scores, sample.m)[some]
         self.evidence += float(slopes.sum()) - len(some) * math.log(self.scale)
+
+    def _fit_duels(self, sample: Sample, levels: F64, some: I64, duels: Duels) -> None:
+        """Fit to scores and to what preferences state of differences: in turns.
+
+        Where there are scores, verdicts among them, these are taken for numbers.
+        """
+        count = len(levels)
+        deviation = float(levels.std()) if count > 1 and levels.std() > 0 else 1.0
+        mean = np.zeros(len(duels.outcomes))
+        variance = np.full(len(mean), 2 * deviation**2)
+        places = torch.tensor(np.concatenate([some, count + np.arange(len(mean))]))
+        for _ in range(comparisons.TURNS):
+            differences, left = duels.sites(mean, variance, deviation)
+            data = Linear(
+                torch.cat([sample.means(), duels.rows]) if count else duels.rows,
+                torch.cat([torch.tensor(1 / sample.m), duels.spread]),
+                torch.tensor(np.concatenate([levels, differences])),
+                noise=torch.tensor(np.concatenate([np.zeros(count), left])),
+            )
+            self.evidence, residuals = self._learn_scales(data.part(places), ITERATIONS)
+            self.posterior = posterior(data, self.theta, self.blocks)
+            self.fitted = True
+            mean, variance = from_others(data, self.theta, self.posterior, LEAST_LEFT[0])
+            mean, variance = mean[count:], variance[count:]
+        about = levels[some] - levels[some].mean() if count else np.zeros(0)
+        total, off = float(about @ about), residuals[: len(some)]
+        self.left_out_r2 = 1 - float(off @ off) / total if total > 0 else 0.0
+        self.verdicts = None
 
     def _fit_verdicts(self, sample: Sample, levels: F64, some: I64) -> None:
         """Fit to what verdicts state of levels, and learn their scale: in turns.
@@ -203,7 +248,7 @@ class Model:
     ) -> Linear:
         """The regression with the slopes J (N,) of F."""
         return Linear(
-            _gathered(sample.steps(), slopes, sample.m),
+            gathered(sample.steps(), slopes, sample.m),
             torch.tensor(np.add.reduceat(slopes * slopes, sample.starts)),
             torch.tensor(targets),
             None if known is None else torch.tensor(known),
@@ -361,11 +406,3 @@ def of_steps(steps: Tensor, weights: Tensor) -> F64:
     """The products phi . w (N,) of steps."""
     f: F64 = (steps @ weights.float()).double().numpy()
     return f
-
-
-def _gathered(steps: Tensor, slopes: F64, m: I64) -> Tensor:
-    """sum_t J_t phi_t (S, D) of each segment, float64."""
-    parts = torch.split(steps, m.tolist())
-    factors = torch.split(torch.tensor(slopes.astype(np.float32)), m.tolist())
-    sums = [factor @ part for factor, part in zip(factors, parts, strict=True)]
-    return torch.stack(sums).double()

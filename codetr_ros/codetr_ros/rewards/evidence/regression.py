@@ -78,3 +78,20 @@ def posterior(data: Linear, theta: F64, blocks: Sequence[slice], spread: bool = 
             return Posterior(mean, torch.zeros(len(root), len(root), dtype=torch.float64))
         inner = torch.cholesky_inverse(factor)
     return Posterior(mean, root[:, None] * inner * root)
+
+
+def from_others(data: Linear, theta: F64, fitted: Posterior, least: float) -> tuple[F64, F64]:
+    """Mean and variance (S,) of each target, as predicted from all others, without its own noise.
+
+    Args:
+        data: the regression.
+        theta: its scales.
+        fitted: its posterior.
+        least: bound of 1 - leverage.
+    """
+    noises = noise(theta, data)
+    variances = fitted.variances(data.rows)
+    left = (1 - variances / noises).clamp_min_(least)
+    off = data.targets - data.rows @ fitted.mean
+    mean: F64 = (data.targets - off / left).numpy()
+    return mean, (variances / left + noises - data.noise).numpy()

@@ -46,6 +46,10 @@ class Sample:
         starts: I64 = np.cumsum(self.m) - self.m
         return starts
 
+    def part(self, places: I64) -> 'Sample':
+        """Some of the segments, of a sample without single steps."""
+        return Sample(self.scores[places], self.m[places], self.rows[torch.tensor(places)])
+
     def steps(self) -> Tensor:
         """Features (N, D) of all steps, for links that ask for them."""
         assert self.rows.dtype == torch.float32, 'this sample was made without single steps'
@@ -159,6 +163,14 @@ class Sampler:
                 states = batch.observations[row, : m + 1]
                 views.append(look(step_inputs(states[:-1], batch.actions[row, :m], states[1:])))
         return views
+
+
+def gathered(steps: Tensor, slopes: F64, m: I64) -> Tensor:
+    """sum_t J_t phi_t (S, D) of each segment, float64."""
+    parts = torch.split(steps, m.tolist())
+    factors = torch.split(torch.tensor(slopes.astype(np.float32)), m.tolist())
+    sums = [factor @ part for factor, part in zip(factors, parts, strict=True)]
+    return torch.stack(sums).double()
 
 
 def _kept(before: dict[int, V], ids: I64, make: Callable[[I64], list[V]]) -> dict[int, V]:

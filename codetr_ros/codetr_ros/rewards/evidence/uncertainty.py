@@ -9,8 +9,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codetr_ros.records import F64, I64
+from codetr_ros.records import F32, F64, I64
 from codetr_ros.rewards.evidence.model import Model, of_steps
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Uncertainty:
+    """How far step rewards may be off, one standard deviation, in the unit of labels.
+
+    Of f and of what a reward has beyond f; that a label also explains its segment's own score is
+    not taken off.
+    """
+
+    steps: F32  # (B, L) of each step's reward, 0 outside of the segments
+    segments: F64  # (B,) of the level of each segment's score, predicted from its steps alone
 
 
 @dataclass(frozen=True, eq=False, slots=True)
