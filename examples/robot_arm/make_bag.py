@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from arm import FASTEST, nearness
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -23,14 +24,6 @@ NS = 10**9
 BEGIN = 1_700_000_000 * NS  # when the recording begins
 SECONDS = 8.0  # of an attempt
 PAUSE = 3.0  # [s] between two attempts
-TARGET = np.array([0.5, 1.2])  # [m]
-FASTEST = np.array([1.5, 2.0])  # [rad/s] of shoulder and elbow
-
-
-def hand(joints: np.ndarray) -> np.ndarray:
-    """Where the hand of an arm with links of one metre is."""
-    upper, fore = joints[0], joints.sum()
-    return np.array([np.cos(upper) + np.cos(fore), np.sin(upper) + np.sin(fore)])
 
 
 def attempt(rng: np.random.Generator, begin: int) -> Iterator[tuple[int, str, Any]]:
@@ -47,7 +40,7 @@ def attempt(rng: np.random.Generator, begin: int) -> Iterator[tuple[int, str, An
             yield now + 2_000_000, '/arm/velocity_commands', command
         speed += 0.5 * (command - speed)
         joints = joints + speed / 50
-        near.append(float(np.exp(-np.linalg.norm(hand(joints) - TARGET))))
+        near.append(float(nearness(joints)))
         if tick % 100 == 99:
             yield now + 4_000_000, '/judge/score', 20 * float(np.mean(near))
             near.clear()

@@ -22,7 +22,11 @@ def make_bag():
     spec = importlib.util.spec_from_file_location('make_bag', ARM / 'make_bag.py')
     module = importlib.util.module_from_spec(spec)
     sys.modules['make_bag'] = module
-    spec.loader.exec_module(module)
+    sys.path.insert(0, str(ARM))  # as where it is started as a program
+    try:
+        spec.loader.exec_module(module)
+    finally:
+        sys.path.remove(str(ARM))
     return module
 
 

@@ -1,0 +1,132 @@
+"""A run on a robot in real processes: the stand-in arm, the nodes, and a test that is the person.
+
+The arm and the inspection are those of examples/robot_arm.
+"""
+
+import json
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rclpy.qos import QoSProfile
+from std_msgs.msg import Bool, Float64MultiArray
+from std_srvs.srv import SetBool, Trigger
+
+from codetr_ros.config import Settings
+from codetr_ros.processes import launcher
+from codetr_ros.runs import folder as run_folder
+from helpers import nodes
+from helpers.builders import tiny
+
+EXAMPLE = Path(__file__).resolve().parents[2] / 'examples' / 'robot_arm'
+DRIVER = f'{nodes.NAMESPACE}/robot_driver'
+
+
+def robot_settings(**changes: Any) -> Settings:
+    """A run of some seconds at twenty steps a second."""
+    small = {
+        'task': 'robot/arm', 'pace': 'free', 'scorer': 'topic', 'evaluate_every': 0, 'steps': 120,
+        'phase_steps': 40, 'warmup_steps': 80, 'delay': 20, 'method': 'evidence', 'requests': 0,
+        'sac.compile': False,
+    }  # fmt: skip
+    return tiny(**(small | changes))
+
+
+def mapping(folder: Path, **live: Any) -> Path:
+    """The example's mapping with other entries in its part `live`, as a file."""
+    made = yaml.safe_load((EXAMPLE / 'live.yaml').read_text())
+    made['live'] |= live
+    path = folder / 'mapping.yaml'
+    path.write_text(yaml.safe_dump(made))
+    return path
+
+
+class RobotRun(nodes.Nodes):
+    """The processes of the run. A context manager: on leaving it, none is left.
+
+    Args:
+        settings: of the run.
+        folder: of the run.
+        live: entries of the mapping's part `live`.
+        autostart: whether the robot moves without being activated.
+    """
+
+    def __init__(
+        self, settings: Settings, folder: Path, autostart: bool = True, **live: Any
+    ) -> None:
+        super().__init__(settings, folder)
+        file = mapping(folder, **live)
+        robot = {'mapping': str(file), 'autostart': autostart}
+        made = launcher.commands(settings, nodes.RUN_ID, folder, robot=robot)
+        self._commands = {command.name: command for command in made}
+        self.names = tuple(self._commands)
+
+    def begin(self, *others: str, inspection: bool = True) -> None:
+        """Start the arm, the inspection and the nodes; `others` are arguments of the arm."""
+        self.start_other('arm', 'stand_in.py', '--log', str(self.folder / 'truth.jsonl'), *others)
+        if inspection:
+            ros = ('--ros-args', '-r', f'__ns:={nodes.NAMESPACE}')
+            self.start_other('inspection', 'inspection.py', '--late', '0.5', *ros)
+        for name in self.names:
+            self.start(name)
+
+    def start_other(self, name: str, script: str, *arguments: str) -> None:
+        """Start a process that is none of this project's."""
+        command = (sys.executable, str(EXAMPLE / script), *arguments)
+        others = launcher.Processes(print)
+        logs = self.folder / run_folder.LOGS
+        others.start([launcher.Command(name, 'robot', command)], logs, self._environment)
+        self._processes.nodes += others.nodes
+
+    def truth(self) -> list[dict[str, Any]]:
+        """What the arm noted: faults and attempts."""
+        lines = (self.folder / 'truth.jsonl').read_text().splitlines()
+        return [json.loads(line) for line in lines]
+
+    def end(self, name: str, number: signal.Signals) -> None:
+        """Send a signal to one process."""
+        (node,) = [node for node in self._processes.nodes if node.name == name]
+        os.kill(node.process.pid, number)
+
+
+class Person(nodes.Witness):
+    """Somebody who watches the commands of the robot, and may stop it."""
+
+    def __enter__(self) -> 'Person':
+        super().__enter__()
+        self.commands: list[list[float]] = []
+        node = self.link.node
+        node.create_subscription(
+            Float64MultiArray,
+            '/arm/velocity_commands',
+            lambda message: self.link.store(self.commands.append, list(message.data)),
+            QoSProfile(depth=100),
+        )
+        self.button = node.create_publisher(Bool, '/arm/emergency_stop', 1)
+        return self
+
+    def call(self, service: str, data: bool | None = None) -> Any:
+        """Call a service of the robot node; its answer."""
+        kind = Trigger if data is None else SetBool
+        client = self.link.node.create_client(kind, f'{DRIVER}/{service}')
+        self.until(client.service_is_ready)
+        request = kind.Request() if data is None else kind.Request(data=data)
+        future = client.call_async(request)
+        self.until(future.done)
+        return future.result()
+
+    def moves(self) -> bool:
+        """Whether one of the last two commands moves the arm."""
+        return any(any(command) for command in self.commands[-2:])
+
+    def rests(self) -> bool:
+        """Whether the last five commands were the safe one, and there are so many."""
+        return len(self.commands) >= 5 and not any(any(c) for c in self.commands[-5:])
+
+    def ticks(self, count: int) -> None:
+        """Wait for so many further commands."""
+        before = len(self.commands)
+        self.until(lambda: len(self.commands) >= before + count)
