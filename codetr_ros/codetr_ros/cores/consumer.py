@@ -244,7 +244,7 @@ class Consumer(Part, ABC):
         report = CoreReport(
             duplicated=dict(self.duplicated),
             refused=dict(self.refused),
-            counters=dict(self._counters),
+            counters=dict(self._counters + self._intake.dropped),
         )
         if self._memory is None:
             return report

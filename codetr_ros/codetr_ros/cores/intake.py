@@ -8,6 +8,7 @@ from typing import Any
 
 from codetr_ros.config import Settings
 from codetr_ros.cores.announced import Tasks
+from codetr_ros.cores.left_out import Absent
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import (
     TOPICS,
@@ -62,6 +63,8 @@ class Intake:
         }  # next sequence number due
         self.duplicated: Counter[str] = Counter()
         self.refused = self.tasks.refused
+        self.absent = Absent()
+        self.dropped: Counter[str] = Counter()  # of sources that were left out of a phase
         self.missing: int | None = None  # a committed phase that is incomplete
         self._due = 0  # the next phase to be taken in
         self._bytes = 0  # of the steps that are held
@@ -75,6 +78,7 @@ class Intake:
         check_run(record, self._run)
         if isinstance(record, TaskSpec):
             self.tasks.announce(record, self.receive)
+            self.absent.announced(record.source)
         elif isinstance(record, Transitions):
             if self.tasks.admit(record):
                 self._hold_steps(record)
@@ -141,6 +145,7 @@ class Intake:
         commit = self._commits.get(phase)
         if commit is None:
             return False
+        self._drop(commit)
         chunks = self._named(commit.sources, commit.transitions, self._transitions, 'transitions')
         scores = (
             self._named(commit.scorers, commit.scores, self._rewards, 'scores')
@@ -169,6 +174,7 @@ class Intake:
         ):
             for name, number in zip(names, last.tolist(), strict=True):
                 self._taken[kind][name] = number + 1
+        self.absent.follow(commit)
         memory.evict()
         self._due = phase + 1
         return True
@@ -186,6 +192,22 @@ class Intake:
         except RecordError as error:  # a wrong score is logged, counted and left out
             self.refused[TOPICS[type(judgement)]] += 1
             _log.error('%s', error)
+
+    def _drop(self, commit: Commit) -> None:
+        """Drop what has come of the sources that are left out of a phase, and void the numbers of
+        what may still come.
+        """
+        for names, last, held, kind, counter in (
+            (commit.sources, commit.transitions, self._transitions, 'transitions', 'steps'),
+            (commit.scorers, commit.scores, self._rewards, 'scores', 'scores'),
+        ):
+            for name, number in zip(names, last.tolist(), strict=True):
+                if name not in commit.dropped:
+                    continue
+                for key in [key for key in held if key[0] == name and key[1] <= number]:
+                    record: Any = held.pop(key)
+                    self.dropped[f'{counter} dropped'] += getattr(record, 'steps', 1)
+                self._taken[kind][name] = max(self._taken[kind][name], number + 1)
 
     def _named(
         self, names: tuple[str, ...], last: Any, held: dict[tuple[str, int], Any], kind: str

@@ -141,13 +141,18 @@ class Learner(Consumer):
         learner, settings = self._learner, self._settings
         assert learner is not None
         sources = self._intake.tasks.sources
+        shares = self._settings.shares_of(phase)
+        steps = [
+            0 if source in self._intake.absent else n
+            for source, n in zip(sources, shares, strict=True)
+        ]
         random = phase < settings.warmup_phases
         return Policy(
             run_id=self._run.run_id,
             phase=phase,
             version=version,
             sources=sources,
-            steps=np.array(settings.shares_of(phase), np.uint32),
+            steps=np.array(steps, np.uint32),
             random=random,
             network='' if random else learner.network,
             weights=b'' if random else weights_bytes(learner.actor),

@@ -7,7 +7,7 @@ a `Commit`. So no record that a node learns from is ever lost.
 import logging
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ import numpy as np
 from codetr_ros.config import Settings
 from codetr_ros.cores.announced import Tasks
 from codetr_ros.cores.core import Part
+from codetr_ros.cores.left_out import LeftOut, voided
 from codetr_ros.records import (
     TOPICS,
     Commit,
@@ -63,6 +64,8 @@ class Recorder(Part):
         self._scores: Counter[str] = Counter()  # next sequence number of each scorer
         self._numbers: defaultdict[str, Numbering] = defaultdict(Numbering)
         self._committed_scores: Counter[str] = Counter()
+        self._left_out = LeftOut(settings)
+        self._counters: Counter[str] = Counter()
         self.refused = self._tasks.refused
         self.phase = 0  # the next to be committed
 
@@ -79,12 +82,7 @@ class Recorder(Part):
         elif isinstance(record, Policy):
             if self._settings.free:
                 return  # nothing waits for a permission
-            due, given = self._settings.steps_of(record.phase), int(record.steps.sum())
-            if record.phase < self.phase or given != due:
-                raise RecordError(
-                    f'{describe(record)} permits {given} steps; phase {self.phase} is the next to '
-                    f'be committed, phase {record.phase} has {due}: stop the second learner'
-                )
+            self._check_permission(record)
             steps = dict(zip(record.sources, record.steps.tolist(), strict=True))
             self._permit(record, {source: n for source, n in steps.items() if n})
         elif isinstance(record, Transitions):
@@ -129,6 +127,50 @@ class Recorder(Part):
             )  # fmt: skip
         self._scores[name] = numbers.next
 
+    def _check_permission(self, policy: Policy) -> None:
+        """Refuse a policy that permits a phase again, or other steps than each source's share.
+
+        Raises:
+            RecordError: says what it permits.
+        """
+        shares = dict.fromkeys(policy.sources, 0)
+        if self._tasks.known:
+            own = self._settings.shares_of(policy.phase)
+            shares |= dict(zip(self._tasks.sources, own, strict=True))
+        given = dict(zip(policy.sources, policy.steps.tolist(), strict=True))
+        due = sum(shares[source] for source, n in given.items() if n)
+        if not self._tasks.known or not any(given.values()):
+            due = self._settings.steps_of(policy.phase)
+        if policy.phase < self.phase or sum(given.values()) != due:
+            raise RecordError(
+                f'{describe(policy)} permits {sum(given.values())} steps; phase {self.phase} is '
+                f'the next to be committed, phase {policy.phase} has {due}: stop the second '
+                'learner'
+            )
+
+    def leave_out(self, sources: Collection[str]) -> list[str]:
+        """Leave sources out of the phase that is waited for: nothing comes from them. If nothing
+        came from any source, nobody is left out, because a phase without steps teaches nothing.
+
+        Args:
+            sources: names of those that are silent.
+
+        Returns:
+            The names of those that are left out now and were not before.
+        """
+        members = self._members(self.phase)
+        if not any(self._there(self.phase, source, n) for source, n in members.items()):
+            return []
+        new = [
+            source
+            for source, steps in members.items()
+            if source in sources
+            and not self._there(self.phase, source, steps)
+            and not self._left_out.is_out(source, self.phase)
+        ]
+        self._left_out.leave_out(new, self.phase)
+        return new
+
     def restore(self, record: Record) -> None:
         """Take one of the records that the bag holds already, in the bag's order, commits among
         them. Call it before `work`, which then goes on with the first phase that has no commit.
@@ -140,6 +182,7 @@ class Recorder(Part):
             if isinstance(record, self.subscribes):
                 self.receive(record)
             return
+        self._left_out.leave_out(record.dropped, record.phase)
         if record.phase != self.phase or not self._whole(record.phase):
             raise RecordError(
                 f'{describe(record)} is in the bag, where phase {self.phase} is the next to be '
@@ -210,25 +253,36 @@ class Recorder(Part):
         members = self._members(phase)
         if not members:
             return False
-        for source, steps in members.items():
-            end = self._ended.get((phase, source))
-            if end is None or self._steps[phase, source] != steps:
-                return False
-            if self._scores[source] < self._committed_scores[source] + end[1]:
-                return False
-        return True
+        return all(
+            self._there(phase, source, steps) or self._left_out.is_out(source, phase)
+            for source, steps in members.items()
+        ) and any(self._there(phase, source, steps) for source, steps in members.items())
+
+    def _there(self, phase: int, source: str, steps: int) -> bool:
+        """Whether all steps and scores of a source are there."""
+        end = self._ended.get((phase, source))
+        if end is None or self._steps[phase, source] != steps:
+            return False
+        return self._scores[source] >= self._committed_scores[source] + end[1]
 
     def _commit(self, phase: int) -> Commit:
-        members = sorted(self._members(phase))
+        steps = self._members(phase)
+        members = sorted(steps)
         self._permitted.pop(phase, None)
         last = []
         scorers = set(self._scores)
+        dropped = []
         for source in members:
+            scorers.add(source)
+            if not self._there(phase, source, steps[source]):
+                dropped.append(source)
+                self._drop(phase, source)
+                last.append(self._transitions[source] - 1)
+                continue
             sequence, due = self._ended.pop((phase, source))
             del self._steps[phase, source]
             last.append(sequence)
             self._committed_scores[source] += due
-            scorers.add(source)
         for scorer in scorers - set(members):  # a person, an inspection: all scores so far
             self._committed_scores[scorer] = self._scores[scorer]
         names = tuple(sorted(s for s in scorers if self._committed_scores[s]))
@@ -240,13 +294,23 @@ class Recorder(Part):
             transitions=np.array(last, np.int64),
             scorers=names,
             scores=scores,
-            dropped=(),
+            dropped=tuple(dropped),
         )
 
     @property
     def due(self) -> int | None:
         """The next phase to be committed."""
         return self.phase
+
+    def _drop(self, phase: int, source: str) -> None:
+        """Drop what came of a source in a phase, and void the numbers of what may still come."""
+        self._counters['steps dropped'] += self._steps.pop((phase, source), 0)
+        self._counters['phases of a source dropped'] += 1
+        self._ended.pop((phase, source), None)
+        self._transitions[source] = voided(self._settings, self._transitions[source]) + 1
+        if not self._settings.scored_elsewhere:
+            self._scores[source] = voided(self._settings, self._scores[source]) + 1
+            self._committed_scores[source] = self._scores[source]
 
     def waiting_for(self) -> str:
         """What the recorder waits for, for people: what the next phase still lacks."""
@@ -276,7 +340,7 @@ class Recorder(Part):
         return CoreReport(
             duplicated=dict(self.duplicated),
             refused=dict(self.refused),
-            counters={'phases_committed': self.phase} | self._left_over(),
+            counters={'phases_committed': self.phase, **self._left_over(), **self._counters},
         )
 
     def _left_over(self) -> dict[str, int]:

@@ -6,8 +6,10 @@ from collections.abc import Iterator
 
 from codetr_ros.config import Settings
 from codetr_ros.cores.core import Part
+from codetr_ros.cores.left_out import LeftOutError, is_left_out
 from codetr_ros.policy.acting import ActingPolicy
 from codetr_ros.records import (
+    Commit,
     Metrics,
     Policy,
     Record,
@@ -58,15 +60,21 @@ class Simulator(Part):
         ]
         self._waiting: dict[int, tuple[Policy, ActingPolicy | None]] = {}
         self._phase = 0  # the next to be run
+        self._resumed = False
+        self._ran = False  # whether it has taken steps since it began or went on
         self._counters: Counter[str] = Counter()
         self._closed = False
 
     def restore(self, record: Record) -> None:
         """Take one of the records that it has published before, in order: transitions, true
-        rewards and scores of committed phases. Those of other sources, and other kinds, are
-        passed over.
+        rewards and scores of committed phases, without those that were dropped, and commits.
+        Those of other sources, and other kinds, are passed over.
         """
         for source in self._sources:
+            if isinstance(record, Commit) and source.name in record.dropped:
+                last = dict(zip(record.sources, record.transitions.tolist(), strict=True))
+                scores = dict(zip(record.scorers, record.scores.tolist(), strict=True))
+                source.skip(last[source.name], scores.get(source.name))
             if getattr(record, 'source', None) == source.name:
                 source.restore(record)
 
@@ -84,6 +92,7 @@ class Simulator(Part):
             TaskError: an environment is at fault.
         """
         self._phase = phase
+        self._resumed = True
         self._counters['phases'] = phase
         for source in self._sources:
             source.resume()
@@ -128,6 +137,7 @@ class Simulator(Part):
         """
         yield [source.spec() for source in self._sources]
         while not self.finished:
+            self._pass_over()
             policy, acting = self._waiting.pop(self._phase, (None, None))
             if policy is None:
                 yield None
@@ -135,10 +145,41 @@ class Simulator(Part):
             self._phase += 1
             if not policy.steps.any():
                 self.finished = True
+            elif is_left_out(self._settings, policy, (each.name for each in self._sources)):
+                self._check_clean(policy.phase)
+                self._counters['phases left out'] += 1
+                yield [source.spec() for source in self._sources]  # it is there: let it in
             else:
+                self._ran = True
                 yield from self._run_phase(policy, acting)
         while True:
             yield None
+
+    def _pass_over(self) -> None:
+        """Pass over phases whose policy never came to a simulator that has joined late, and that
+        are committed: a newer policy was published after them.
+        """
+        committed = max(self._waiting, default=-1) - self._settings.lag
+        joined_late = self._resumed and not self._ran
+        if not joined_late or self._phase in self._waiting or committed < self._phase:
+            return
+        self._counters['phases left out'] += committed + 1 - self._phase
+        self._phase = committed + 1
+        for phase in [phase for phase in self._waiting if phase <= committed]:
+            del self._waiting[phase]
+
+    def _check_clean(self, phase: int) -> None:
+        """Refuse to go on with episodes whose last steps were dropped.
+
+        Raises:
+            LeftOutError: it has taken steps since it began or went on.
+        """
+        if self._ran:
+            raise LeftOutError(
+                f'{self._name!r} was left out of the run before phase {phase}, because nothing '
+                'came from it for too long: its steps since then are dropped. Start it again: it '
+                'joins again with the next phase'
+            )
 
     def _run_phase(self, policy: Policy, acting: ActingPolicy | None) -> Iterator[list[Record]]:
         going = [

@@ -87,6 +87,17 @@ class Source:
         """
         self._recorded.take(record)
 
+    def skip(self, sequence: int, scores: int | None) -> None:
+        """Go on behind numbers that are voided, because this source was left out of a phase.
+
+        Args:
+            sequence: the last voided one of chunks.
+            scores: the last voided one of scores; None: this source gives none.
+        """
+        self._recorded.sequence = sequence + 1
+        if scores is not None:
+            self._recorded.scores = scores + 1
+
     def resume(self) -> None:
         """Go on where what was restored ends: the episode that was under way is under way again.
 

@@ -1,0 +1,208 @@
+"""A source from which nothing comes is left out of a phase, by everybody, and joins again."""
+
+import numpy as np
+import pytest
+
+from codetr_ros.cores.intake import Intake
+from codetr_ros.cores.learner import Learner
+from codetr_ros.cores.left_out import LeftOutError, is_left_out, undropped, voided
+from codetr_ros.cores.recorder import Recorder
+from codetr_ros.cores.simulator import Simulator
+from codetr_ros.memory.trajectories import Trajectories
+from codetr_ros.records import Commit, Policy, TaskSpec, Transitions
+from helpers.builders import commit, policy, run, score, task_spec, tiny, transitions
+from helpers.cores import slices
+
+BOTH = ('sim', 'sim_2')
+SETTINGS = tiny(simulators=2, steps=40, phase_steps=10, warmup_steps=10)
+VOIDED = (SETTINGS.lag + 1) * 10  # fewer records than that are under way
+
+
+def permission(phase=0, steps=(5, 5)):
+    return policy(phase=phase, sources=BOTH, steps=np.array(steps, np.uint32))
+
+
+def recorder(settings=SETTINGS):
+    made = Recorder(run(settings), settings, 'record')
+    for name in BOTH:
+        made.receive(task_spec(source=name))
+    return made, made.work()
+
+
+def commits(work):
+    return [record for record in slices(work) if isinstance(record, Commit)]
+
+
+def whole(source='sim', sequence=0, phase=0, **changes):
+    return transitions(source=source, sequence=sequence, phase=phase, phase_end=True, **changes)
+
+
+def test_a_phase_is_committed_without_a_silent_source_whose_numbers_are_voided():
+    made, work = recorder()
+    made.receive(permission())
+    made.receive(whole())
+    made.receive(transitions(source='sim_2', steps=3))
+    made.receive(score(source='sim_2', scorer='sim_2', length=3))
+    assert commits(work) == []
+    assert made.leave_out(['sim_2']) == ['sim_2']
+    (first,) = commits(work)
+    assert first.dropped == ('sim_2',)
+    assert (first.sources, first.transitions.tolist()) == (BOTH, [0, 1 + VOIDED])
+    assert (first.scorers, first.scores.tolist()) == (('sim_2',), [1 + VOIDED])
+    made.receive(whole('sim_2', 1, first_step=3, steps=2))  # late
+    assert made.duplicated == {'transitions': 1}
+    counters = made.report().counters
+    assert counters['steps dropped'] == 3
+    assert counters['phases of a source dropped'] == 1
+
+
+def test_a_source_joins_again_behind_the_voided_numbers():
+    made, work = recorder()
+    made.receive(permission())
+    made.receive(whole())
+    made.leave_out(['sim_2'])
+    (first,) = commits(work)
+    made.receive(permission(1, (5, 0)))  # the learner permits it nothing
+    made.receive(whole(sequence=1, phase=1, first_step=5))
+    (second,) = commits(work)
+    assert (second.sources, second.dropped) == (('sim',), ())
+    made.receive(permission(2))
+    made.receive(whole(sequence=2, phase=2, first_step=10))
+    number = int(first.transitions[1]) + 1
+    made.receive(whole('sim_2', number, 2))
+    (third,) = commits(work)
+    assert (third.sources, third.dropped) == (BOTH, ())
+    assert third.transitions.tolist() == [2, number]
+
+
+def test_with_overlap_the_phase_that_was_permitted_meanwhile_waits_for_nobody_either():
+    made, work = recorder(SETTINGS.changed({'overlap': True}))
+    made.receive(permission())
+    made.receive(permission(1))
+    made.receive(whole())
+    made.receive(whole(sequence=1, phase=1, first_step=5))
+    made.leave_out(['sim_2'])
+    assert [one.dropped for one in commits(work)] == [('sim_2',), ('sim_2',)]
+
+
+def test_nobody_is_left_out_of_a_phase_that_nobody_has_rolled_out():
+    made, work = recorder()
+    made.receive(permission())
+    assert made.leave_out(BOTH) == []
+    made.receive(whole())
+    assert made.leave_out(['sim']) == []  # it is there
+    assert commits(work) == []
+
+
+def test_a_recorder_that_goes_on_with_its_bag_drops_what_was_dropped():
+    made, work = recorder()
+    there = [permission(), whole(), transitions(source='sim_2', steps=3)]
+    for record in there:
+        made.receive(record)
+    made.leave_out(['sim_2'])
+    there += commits(work)
+    again, work = recorder()
+    for record in there:
+        again.restore(record)
+    again.receive(permission(1, (5, 0)))
+    again.receive(whole(sequence=1, phase=1, first_step=5))
+    (second,) = commits(work)
+    assert (second.phase, second.transitions.tolist()) == (1, [1])
+
+
+def test_consumers_take_in_nothing_of_a_source_that_was_left_out_however_late_it_comes():
+    intake = Intake(run(SETTINGS), SETTINGS, scores=True)
+    for name in BOTH:
+        intake.receive(task_spec(source=name))
+    memory = Trajectories(3, 2, SETTINGS.delay, 100, 100)
+    intake.receive(whole())
+    intake.receive(transitions(source='sim_2', steps=3))
+    last = voided(SETTINGS, 1)
+    numbers = np.array([0, last], np.int64)
+    intake.receive(commit(sources=BOTH, transitions=numbers, dropped=('sim_2',)))
+    assert intake.take(0, memory)
+    assert memory.steps == 5
+    assert intake.dropped == {'steps dropped': 3}
+    intake.receive(transitions(source='sim_2', sequence=1, first_step=3, steps=2))
+    assert intake.duplicated == {'transitions': 1}
+    intake.receive(whole('sim_2', last + 1, 1))
+    intake.receive(commit(phase=1, sources=('sim_2',), transitions=np.array([last + 1], np.int64)))
+    assert intake.take(1, memory)
+    assert memory.steps == 10
+
+
+def permitted(core, work):
+    return [r for r in slices(work) if isinstance(r, Policy)]
+
+
+def test_the_learner_permits_a_source_nothing_until_it_has_announced_itself_again():
+    core = Learner(run(SETTINGS), SETTINGS.changed({'warmup_steps': 40}), 'learner', None)
+    for name in BOTH:
+        core.receive(task_spec(source=name))
+    work = core.work()
+    assert [p.steps.tolist() for p in permitted(core, work)] == [[5, 5]]
+    core.receive(whole())
+    core.receive(commit(sources=BOTH, transitions=np.array([0, 30], np.int64), dropped=('sim_2',)))
+    assert [p.steps.tolist() for p in permitted(core, work)] == [[5, 0]]
+    core.receive(task_spec(source='sim_2'))
+    core.receive(whole(sequence=1, phase=1, episode=1))
+    core.receive(commit(phase=1, transitions=np.array([1], np.int64)))
+    assert [p.steps.tolist() for p in permitted(core, work)] == [[5, 5]]
+
+
+def simulator(name='sim_2'):
+    settings = SETTINGS.changed({'warmup_steps': 40, 'delay': 5})
+    made = Simulator(run(settings), settings, name)
+    return made, made.work()
+
+
+def test_a_simulator_that_was_left_out_announces_itself_and_goes_on_behind_what_was_voided():
+    before, work = simulator()
+    before.receive(permission(steps=(3, 3)))
+    records = slices(work)
+    numbers = np.array([0, 0], np.int64)
+    kept = commit(sources=BOTH, transitions=numbers, scorers=BOTH, scores=np.array([0, 0]))
+    out = commit(
+        phase=1,
+        sources=BOTH,
+        transitions=np.array([1, 40], np.int64),
+        scorers=BOTH,
+        scores=np.array([1, 50]),
+        dropped=('sim_2',),
+    )
+    dropped = transitions(source='sim_2', sequence=4, phase=1, first_step=5)
+    again, work = simulator()
+    for record in undropped([*records, kept, dropped, out]):
+        again.restore(record)
+    again.resume(2)
+    assert [type(record) for record in slices(work)] == [TaskSpec]
+    again.receive(permission(2, (5, 0)))
+    assert [type(record) for record in slices(work)] == [TaskSpec]
+    again.receive(permission(3))
+    chunk, *_ = [record for record in slices(work) if isinstance(record, Transitions)]
+    assert (chunk.sequence, chunk.phase, chunk.episode, chunk.first_step) == (41, 3, 0, 3)
+    np.testing.assert_array_equal(chunk.observations[0], records[1].observations[-1])
+    assert again.report().counters['phases left out'] == 1
+
+
+def test_a_simulator_that_went_on_while_it_was_left_out_must_start_again():
+    made, work = simulator()
+    made.receive(permission())
+    slices(work)
+    made.receive(permission(1, (5, 0)))
+    with pytest.raises(LeftOutError, match="'sim_2' was left out of the run before phase 1"):
+        next(work)
+
+
+def test_a_simulator_that_begins_late_passes_over_what_is_committed():
+    made, work = simulator()
+    made.resume(0)
+    made.receive(permission(2))
+    found = [record for record in slices(work) if isinstance(record, Transitions)]
+    assert [chunk.phase for chunk in found] == [2]
+
+
+def test_a_share_of_nothing_is_not_being_left_out():
+    small = SETTINGS.changed({'steps': 1, 'phase_steps': 1})
+    assert not is_left_out(small, permission(0, (1, 0)), ['sim_2'])
+    assert is_left_out(SETTINGS, permission(0, (10, 0)), ['sim_2'])
