@@ -3,11 +3,13 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 
+from codetr_ros.simtest.disks import Trouble
 from codetr_ros.simtest.plan import all_settings, plan
-from codetr_ros.simtest.run import simulate
+from codetr_ros.simtest.run import carry_out, simulate
 
 QUICK, MANY = range(24), range(24, 200)
 
@@ -44,11 +46,14 @@ def test_seeds_draw_every_kind_of_run_and_every_kind_of_trouble():
 
 
 def test_a_run_that_cannot_be_mended_ends_by_errors_that_name_a_cause():
-    ended = [simulate(seed) for seed in (36, 39)]  # the disk fails to sync; it is full
-    assert ['Input/output error' in each.errors['record'] for each in ended] == [True, False]
-    assert 'No space left on device' in ended[1].errors['record']
-    assert all('record /record' in each.errors['learner'] for each in ended)
-    assert [each.failures for each in ended] == [[], []]
+    for disk, cause in (
+        (Trouble(syncs=2), 'Input/output error'),
+        (Trouble(room=60_000), 'No space left on device'),
+    ):
+        ended = carry_out(replace(plan(0), disk=disk, heals=False))
+        assert cause in ended.errors['record']
+        assert 'record /record' in ended.errors['learner']
+        assert ended.failures == []
 
 
 PROGRAM = """

@@ -153,8 +153,18 @@ class Simulated:
             )
         if not self.failures:
             self.failures += checks.at_the_end(self)
-        gave_up = {p.name: errors.in_words(p.error) for p in processes if p.error is not None}
-        return Outcome(self.plan, self.failures, gave_up, self.world.now, self.world.trace())
+        gave_up = {
+            p.name: self._named(errors.in_words(p.error))
+            for p in processes
+            if p.error is not None
+        }
+        failures = [self._named(text) for text in self.failures]
+        trace = [self._named(text) for text in self.world.trace()]
+        return Outcome(self.plan, failures, gave_up, self.world.now, trace)
+
+    def _named(self, text: str) -> str:
+        """A text without the name of the folder, which differs from run to run."""
+        return text.replace(f'{self.folder.parent}/', '')
 
 
 @contextmanager
@@ -175,8 +185,17 @@ def simulate(seed: int, kept: int = 400) -> Outcome:
         seed: from which the run and all its troubles are drawn.
         kept: how many of the newest events the trace holds.
     """
+    return carry_out(plan(seed), kept)
+
+
+def carry_out(planned: Plan, kept: int = 400) -> Outcome:
+    """Simulate a run as it is planned, and judge it.
+
+    Args:
+        planned: what will happen.
+        kept: how many of the newest events the trace holds.
+    """
     torch.set_num_threads(1)
-    planned = plan(seed)
     with tempfile.TemporaryDirectory(prefix='codetr_simtest_', dir=_memory()) as folder, _quiet():
         return Simulated(planned, Path(folder) / run_folder.BAG, kept).run()
 
