@@ -38,7 +38,7 @@ def test_a_failing_seed_is_named_with_its_failure_and_the_events_before(capsys, 
     assert cli.main(['simtest', '--seed', '1']) == cli.FAILED
     printed = capsys.readouterr().out
     assert 'seed 1: the sky fell' in printed
-    assert 'learner     fails: ' in printed
+    assert '  learner     ' in printed
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from helpers.cores import slices
 
 BOTH = ('sim', 'sim_2')
 SETTINGS = tiny(simulators=2, steps=40, phase_steps=10, warmup_steps=10)
-VOIDED = (SETTINGS.lag + 1) * 10  # fewer records than that are under way
+VOIDED = SETTINGS.lag * 10  # no more records than that are under way
 
 
 def permission(phase=0, steps=(5, 5)):

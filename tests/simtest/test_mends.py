@@ -9,7 +9,7 @@ import pytest
 
 from codetr_ros.bags import writer
 from codetr_ros.cores import announced, intake, learner, recorder
-from codetr_ros.nodes import fetching, patience, settling
+from codetr_ros.nodes import fetching, patience, peers, settling, traffic
 from codetr_ros.nodes.last_phases import LastPhases
 from codetr_ros.records import TOPICS
 from codetr_ros.simtest.run import simulate
@@ -109,6 +109,41 @@ def forget_the_last_phases(patch):
     patch.setattr(LastPhases, 'hold', lambda self, record, raw: None)
 
 
+def count_strangers(patch):
+    def decode(self, kind, data):
+        self.received[TOPICS[kind]] += 1
+        self.run_id = 'nobody'  # so that the real one counts nothing
+        return real(self, kind, data)
+
+    real = traffic.Traffic.decode
+    patch.setattr(traffic.Traffic, 'decode', decode)
+
+
+def forget_who_has_ended(patch):
+    def note(self, presence, now):
+        self.by_instance.pop(presence.instance_id, None)
+        return real(self, presence, now)
+
+    real = peers.Peers.note
+    patch.setattr(peers.Peers, 'note', note)
+
+
+def commit_before_counting_the_phase(patch):
+    def commit(self, phase):
+        made = real(self, phase)
+        self.phase = phase
+        return made
+
+    def work(self):
+        for out in whole(self):
+            yield out
+            self.phase += out is not None
+
+    real, whole = recorder.Recorder._commit, recorder.Recorder.work
+    patch.setattr(recorder.Recorder, '_commit', commit)
+    patch.setattr(recorder.Recorder, 'work', work)
+
+
 def never_give_up(patch):
     patch.setattr(patience.Patience, 'check', lambda self, now, waiting, doing, lost: None)
 
@@ -137,13 +172,16 @@ MENDS: dict[Callable, str] = {
     hold_what_came_twice: 'repeated messages',
     take_in_by_arrival: 'other weights|gave up',
     train_before_the_commit: 'other weights|fault|gave up',
-    commit_without_scores: 'not sound|are whole',
+    commit_without_scores: 'not sound|are whole|gave up',
     commit_half_a_phase: 'not sound|are whole|gave up|fault',
     flush_without_syncing: 'before it is on the disk',
     sync_without_ending_the_chunk: 'before it is on the disk',
     leave_half_a_chunk: 'not sound: file',
     never_fetch_again: 'gave up',
     forget_the_last_phases: 'gave up',
+    count_strangers: 'were published on|not sound',
+    forget_who_has_ended: 'gave up|stuck',
+    commit_before_counting_the_phase: 'were published on|not sound',
     never_give_up: 'stuck',
     end_before_all_is_there: 'were published on|names no cause|not sound',
     take_labels_again: 'repeated messages',

@@ -236,7 +236,6 @@ class Recorder(Part):
                 metrics(self._run.run_id, 'record', self._name, phase, step, values),
                 self._commit(phase),
             ]
-            self.phase = phase + 1
         self.finished = True
         while True:
             yield None
@@ -285,6 +284,7 @@ class Recorder(Part):
             self._committed_scores[source] += due
         for scorer in scorers - set(members):  # a person, an inspection: all scores so far
             self._committed_scores[scorer] = self._scores[scorer]
+        self.phase = phase + 1  # at once: labels of the phase may be here before the next slice
         names = tuple(sorted(s for s in scorers if self._committed_scores[s]))
         scores = np.array([self._committed_scores[s] - 1 for s in names], np.int64)
         return Commit(

@@ -49,6 +49,8 @@ class Peers:
     def note(self, presence: Presence, now: float) -> str | None:
         """Note a peer's presence; returns what is new about it, for the log."""
         known = self.by_instance.get(presence.instance_id)
+        if known is not None and known.presence.finished and not presence.finished:
+            return None  # an earlier one, which the last one has overtaken
         served = bool(presence.settings_hash) or (known is not None and known.served)
         self.by_instance[presence.instance_id] = Peer(presence, now, served)
         who = f'{presence.role} {presence.node}'

@@ -66,7 +66,8 @@ class Traffic:
     Attributes:
         core: takes the records; a silent one until the node has joined.
         settings: those of the run, once it is known.
-        received: messages that arrived, sound or not.
+        run_id: the run, once it is known.
+        received: messages of this run that arrived, sound or not.
         refused: those of them that were refused.
         recovered: records that were lost, and arrived when fetched again.
         ledger: counts of the records that peers have published.
@@ -82,6 +83,7 @@ class Traffic:
         self._clock = clock
         self.core: Core[Any] = Silent()
         self.settings: Settings | None = None
+        self.run_id = ''
         self.received: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
         self.recovered: Counter[str] = Counter()
@@ -90,13 +92,18 @@ class Traffic:
 
     def decode(self, kind: type, data: bytes) -> Record | None:
         """The record in a message that arrived; None if it must be refused, which is counted."""
-        if kind not in (Presence, RunSpec):  # of which nothing is missed
-            self.received[TOPICS[kind]] += 1  # sound or not, it is not lost
+        ours = kind not in (Presence, RunSpec)  # of which nothing is missed
         try:
-            return arrived(kind, data)
+            record = arrived(kind, data)
+            # what is of another run must not stand in for what is lost of this one
+            ours = ours and self.run_id in ('', record.run_id)
+            return record
         except RecordError as error:
             self.refuse(kind, error)
             return None
+        finally:
+            if ours:
+                self.received[TOPICS[kind]] += 1  # sound or not, it is not lost
 
     def receive(self, record: Record, taker: Taker | None = None) -> bool:
         """Hand a record to the core, or to another taker; returns whether it was new and taken."""

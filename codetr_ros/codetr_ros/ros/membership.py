@@ -164,6 +164,8 @@ class Membership:
         """
         self.traffic.core, self.traffic.settings = core, settings
         self._serves = True
+        if self.run is not None:
+            self.traffic.run_id = self.run.run_id
         if self.run is not None and Commit in core.subscribes:
             self._fetcher = Fetcher(self.link, self.run.run_id, self.traffic)
 

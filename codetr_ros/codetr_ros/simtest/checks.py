@@ -40,7 +40,7 @@ def at_the_end(run: 'Simulated') -> list[str]:
     found += _weights(run)
     found += _uncounted(processes)
     found += _bag(run, whole=not gave_up)
-    if not gave_up and not run.plan.weather.strangers:
+    if not gave_up:
         found += _unrecorded(run)
     return found
 

@@ -2,9 +2,8 @@
 
 It promises what reliable DDS does, and no more. Messages of one publisher to one reader keep their
 order on a topic if the reader is the recorder, which counts on that; for others even that is
-broken. What the recorder numbers may reach it twice, everything may reach others twice. Topics
-that are transient local reach a reader after any partition. On other topics a partition that
-outlasts the lease of the middleware loses what was published meanwhile.
+broken. Topics that are transient local reach a reader after any partition. On other topics a
+partition that outlasts the lease of the middleware loses what was published meanwhile.
 """
 
 from collections import Counter
@@ -16,13 +15,18 @@ from codetr_ros.records import (
     Commit,
     CompositeReward,
     Policy,
+    Presence,
     RunSpec,
+    StepRewards,
     TaskSpec,
     Transitions,
+    TrueRewards,
 )
 from codetr_ros.simtest.world import World
 
 LEASE = 20.0  # [s] of silence after which the middleware takes a participant for gone
+NUMBERED = (Transitions, CompositeReward, TrueRewards, StepRewards, Presence)
+"""Kinds of which a recorder knows second copies."""
 KEPT_FOR_LATE = (RunSpec, TaskSpec, Policy, Commit)
 """What is published transient local (`ros/qos.py`)."""
 FETCHED_AGAIN = (Transitions, CompositeReward)
@@ -108,11 +112,11 @@ class Network:
             return
         arrival = begin + world.rng.expovariate(1 / weather.delay)
         if ordered or not weather.reorder:
-            # until a recorder holds steps of sources that have not announced themselves
-            key = sender, reader, Transitions if ordered and kind is TaskSpec else kind
+            key = sender, reader, kind
             arrival = self._last[key] = max(arrival, self._last.get(key, 0.0))
         world.at(arrival, handle)
-        twice = kind in TOPICS and (kind in FETCHED_AGAIN or not ordered)
+        # copies of other kinds reach the bag
+        twice = kind in TOPICS and (kind in NUMBERED or not ordered)
         if twice and world.rng.random() < weather.doubled:
             self.doubled[reader, topic] += 1
             world.at(arrival + world.rng.expovariate(1 / weather.delay), handle)

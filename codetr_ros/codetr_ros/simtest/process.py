@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from codetr_ros.bags.definitions import decode, encode
+from codetr_ros.bags.definitions import encode
 from codetr_ros.config import Settings
 from codetr_ros.cores.core import Core
 from codetr_ros.nodes.errors import NodeError
@@ -149,6 +149,7 @@ class Process:
         self.log = _Log(world, name)
         self.traffic = Traffic(self.log, lambda: world.now)
         self.traffic.core = core
+        self.traffic.settings, self.traffic.run_id = settings, run.run_id
         self._settings = settings
         self._pace = pace
         self._work = core.work()
@@ -254,14 +255,15 @@ class Process:
         elif isinstance(packet.data, FetchAnswer):
             self.world.note(self.name, f'phase {packet.data.phase} came again')
             for kind, raw in packet.data.messages:
-                self.traffic.receive_again(decode(kind, raw))
+                self.traffic.take_again(kind, raw)
         else:
             self.take(packet.kind, packet.data)
 
-    def take(self, kind: type, raw: bytes) -> bool:
-        """Take the bytes of a message; returns whether the core took the record."""
-        self.traffic.received[TOPICS[kind]] += 1
-        return self.traffic.receive(decode(kind, raw))
+    def take(self, kind: type, raw: bytes) -> None:
+        """Take the bytes of a message."""
+        record = self.traffic.decode(kind, raw)
+        if record is not None:
+            self.traffic.receive(record)
 
     def _ask_again(self) -> None:
         if self._fetching is None or not self._fetching.due(self.core.missing, self.world.now):

@@ -2,15 +2,17 @@
 
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-from codetr_ros.bags.definitions import decode, encode
+from codetr_ros.bags.definitions import encode
 from codetr_ros.bags.topics import BagTopic
 from codetr_ros.bags.writer import McapWriter
+from codetr_ros.config import Settings
+from codetr_ros.cores.beside import Beside, Early
+from codetr_ros.cores.recorder import Recorder
 from codetr_ros.nodes.last_phases import LastPhases
 from codetr_ros.nodes.settling import Settling, still_missing
-from codetr_ros.records import TOPICS, Commit, Presence, Record, RecordError, RunSpec
-from codetr_ros.records.checks import check_run
+from codetr_ros.records import TOPICS, Commit, Presence, Record, RunSpec, TaskSpec
 from codetr_ros.records.fields import type_name
 from codetr_ros.records.roles import published_by
 from codetr_ros.simtest.disks import TroubledDisk
@@ -24,14 +26,17 @@ CHUNK_BYTES = 2048
 class Recording(Process):
     """The recorder: writes what arrives, and publishes a commit once it is on the disk."""
 
-    def __init__(self, *given: Any, folder: Path, disk: TroubledDisk, lag: int) -> None:
+    def __init__(self, *given: Any, folder: Path, disk: TroubledDisk, settings: Settings) -> None:
         super().__init__(*given)
         self.disk = disk
         self.recorded: Counter[str] = Counter()
         self._full = {kind: f'/run/{TOPICS[kind]}' for kind in RECORDED}
         topics = [BagTopic(self._full[kind], type_name(kind), 16, False) for kind in RECORDED]
         self._bag = McapWriter(folder, topics, CHUNK_BYTES, keep_free=0, disk=disk)
-        self._last = LastPhases(lag + 2)
+        self._last = LastPhases(settings.ahead + 2)
+        core = cast(Recorder, self.core)
+        self._beside = Beside(self.run, settings, lambda: core.phase)
+        self._early = Early(settings)
         self._settling = Settling(f'/{self.name}', self.peers, self.limit)
         self._write(RunSpec, encode(self.run))
 
@@ -39,25 +44,23 @@ class Recording(Process):
         self._bag.write(self._full[kind], raw, round(self.world.now * 1e9))
         self.recorded[TOPICS[kind]] += 1
 
-    def take(self, kind: type, raw: bytes) -> bool:
-        """Write the bytes of a message, and hand the record to the core."""
-        if kind in self.core.subscribes:
-            taken = super().take(kind, raw)
-        else:
-            self.traffic.received[TOPICS[kind]] += 1
-            taken = self._is_ours(kind, raw)
-        if taken:
-            self._write(kind, raw)
-            self._last.hold(decode(kind, raw), raw)
-        return taken
+    def take(self, kind: type, raw: bytes) -> None:
+        """Take the bytes of a message: what is admitted is written as it came."""
+        record = self.traffic.decode(kind, raw)
+        if record is not None:
+            self._admit(record, raw)
 
-    def _is_ours(self, kind: type, raw: bytes) -> bool:
-        try:
-            check_run(decode(kind, raw), self.run)
-        except RecordError as error:
-            self.traffic.refuse(kind, error)
-            return False
-        return True
+    def _admit(self, record: Record, raw: bytes) -> None:
+        if self._early.holds(record, raw):
+            return
+        learnt_from = type(record) in self.core.subscribes
+        if not self.traffic.receive(record, None if learnt_from else self._beside):
+            return
+        self._write(type(record), raw)
+        self._last.hold(record, raw)
+        if isinstance(record, TaskSpec):
+            for waiting, data in self._early.announced(record.source):
+                self._admit(waiting, data)
 
     def _take(self, packet: Packet) -> None:
         if isinstance(packet.data, FetchRequest):

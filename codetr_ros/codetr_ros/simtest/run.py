@@ -112,7 +112,7 @@ class Simulated:
             )  # fmt: skip
             try:
                 made = (
-                    Recording(*common, folder=folder, disk=self.disk, lag=settings.lag)
+                    Recording(*common, folder=folder, disk=self.disk, settings=settings)
                     if role == 'record'
                     else Process(*common)
                 )
@@ -146,7 +146,8 @@ class Simulated:
         )
         for each in processes:
             each.core.close()
-        if not over:
+        # what never reached the recorder is not sent again, and nobody notices who waits for whom
+        if not over and not self.plan.weather.overrun:
             waiting = [f'{p.name} {p.doing}' for p in processes if not p.ended]
             self.failures.append(
                 f'stuck at {self.world.now:.0f} s: nobody ends the wait: {"; ".join(waiting)}'
@@ -154,9 +155,7 @@ class Simulated:
         if not self.failures:
             self.failures += checks.at_the_end(self)
         gave_up = {
-            p.name: self._named(errors.in_words(p.error))
-            for p in processes
-            if p.error is not None
+            p.name: self._named(errors.in_words(p.error)) for p in processes if p.error is not None
         }
         failures = [self._named(text) for text in self.failures]
         trace = [self._named(text) for text in self.world.trace()]

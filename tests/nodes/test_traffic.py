@@ -1,0 +1,19 @@
+"""Messages are counted where they arrive: of this run, sound or not."""
+
+import logging
+from dataclasses import replace
+
+from codetr_ros.bags.definitions import encode
+from codetr_ros.nodes.traffic import Traffic
+from codetr_ros.records import Transitions
+from helpers.builders import transitions
+
+
+def test_what_is_of_another_run_does_not_stand_in_for_what_is_lost_of_this_one():
+    traffic = Traffic(logging.getLogger(__name__))
+    traffic.run_id = 'run'
+    for record in (transitions(), replace(transitions(), run_id='another')):
+        assert traffic.decode(Transitions, encode(record)) is not None
+    assert traffic.decode(Transitions, b'junk') is None
+    assert traffic.received == {'transitions': 2}  # one sound, one not
+    assert traffic.refused == {'transitions': 1}
