@@ -152,7 +152,7 @@ class Simulated:
             self.failures.append(
                 f'stuck at {self.world.now:.0f} s: nobody ends the wait: {"; ".join(waiting)}'
             )
-        if not self.failures:
+        if over and not self.failures:
             self.failures += checks.at_the_end(self)
         gave_up = {
             p.name: self._named(errors.in_words(p.error)) for p in processes if p.error is not None
