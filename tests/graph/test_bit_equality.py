@@ -8,9 +8,11 @@ from typing import Any
 
 import pytest
 
+from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.verify import verify
 from codetr_ros.config import Settings
 from codetr_ros.cores import in_process
+from codetr_ros.offline.replay import replay
 from codetr_ros.runs.summary import Summary
 from helpers.builders import tiny
 from helpers.runs import train
@@ -70,6 +72,11 @@ def test_over_topics_and_in_process_end_with_the_same_weights(tmp_path, task, me
     as_users_do = (task, method, pace) == CASES[0]
     topics, _ = train(settings, tmp_path / 'topics', installed=as_users_do)
     check_same(topics, by_calls(settings))
+    if (task, method, pace) == QUICKLY:
+        folder = tmp_path / 'topics' / 'checkpoints'
+        replayed = replay(Bag(topics['bag']), folder)
+        assert replayed.first is None
+        assert replayed.same['checkpoint of the learner'] == 3
 
 
 @pytest.mark.slow

@@ -21,6 +21,7 @@ commands:
   report     make the report of a run, however it was started, or of a benchmark
   watch      show a run in the browser, while it lasts or later
   evaluate   evaluate the policy of a run's newest checkpoint
+  replay     derive a run's weights again from its bag, and compare them
   benchmark  do many runs under one protocol, and make a table of them
   bag        show, check, recover or play a bag
   demo       a whole example in one command: a robot in real time
@@ -75,6 +76,12 @@ def _watch(arguments: Sequence[str]) -> int:
     return watch.main(arguments)
 
 
+def _replay(arguments: Sequence[str]) -> int:
+    from codetr_ros.cli import replay
+
+    return replay.main(arguments)
+
+
 def _benchmark(arguments: Sequence[str]) -> int:
     from codetr_ros.cli import benchmark
 
@@ -119,6 +126,7 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     'evaluate': _evaluate,
     'report': _report,
     'watch': _watch,
+    'replay': _replay,
     'benchmark': _benchmark,
     'bag': _bag,
     'demo': _demo,

@@ -202,6 +202,10 @@ class Consumer(Part, ABC):
     def _state(self) -> dict[str, torch.Tensor]:
         """The tensors that a checkpoint holds beside those of the memory."""
 
+    def trained(self) -> dict[str, torch.Tensor]:
+        """What has been trained so far, by name: copies."""
+        return self._state()
+
     @abstractmethod
     def _facts(self) -> dict[str, Any]:
         """What a checkpoint holds beside tensors, for this core to go on: as JSON."""
@@ -236,7 +240,9 @@ class Consumer(Part, ABC):
             },
         }
         tensors = self._state() | going_on.memory_tensors(self._memory)
-        checkpoints.save(self._folder, self.role, done, tensors, meta)
+        # a run goes on from `lag` phases before its last commit, and one before that is kept
+        keep = self._settings.lag + 2
+        checkpoints.save(self._folder, self.role, done, tensors, meta, keep)
         self._saved = done
 
     def report(self) -> CoreReport:

@@ -35,11 +35,11 @@ class Recorded:
 
     def made(self, parts: StepRewards) -> None:
         """Remember the labels made of one phase."""
-        self._made.update(_segments(parts))
+        self._made.update(segments_of(parts))
 
     def recorded(self, parts: StepRewards) -> None:
         """Compare labels that were recorded."""
-        for key, labels in _segments(parts):
+        for key, labels in segments_of(parts):
             if self._made.get(key) == labels:
                 self.same += 1
             else:
@@ -63,7 +63,8 @@ class Fold:
     recorded: Recorded
 
 
-def _segments(parts: StepRewards) -> Iterator[tuple[tuple[int, str, int, int], bytes]]:
+def segments_of(parts: StepRewards) -> Iterator[tuple[tuple[int, str, int, int], bytes]]:
+    """Phase, source, episode and first step of each row of labels, and the labels themselves."""
     ends = np.cumsum(parts.lengths, dtype=np.int64)
     for episode, first, length, end in zip(
         parts.episodes.tolist(),
