@@ -12,6 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from codetr_ros.processes.launcher import end_with_parent
+
 DRIVERS = ('egl', 'osmesa')
 """Values of MUJOCO_GL that need no display, in the order in which they are tried."""
 NOT_TO_BE_DRAWN = 3
@@ -71,6 +73,7 @@ def draw(
                 errors='replace',
                 timeout=max(left, 0.001),
                 check=False,
+                preexec_fn=end_with_parent(),
             )
         except subprocess.TimeoutExpired:
             faults.append(f'{driver}: not done within {deadline:g} s')

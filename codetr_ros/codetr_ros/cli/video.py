@@ -8,6 +8,8 @@ import math
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,6 +34,48 @@ MOST_FRAMES = 50.0
 UNKNOWN_PERIOD = 0.04
 """Seconds that a step is shown, where the task has no time."""
 SUFFIX = '.mp4'
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How a video goes on, so that the robot moves as fast as it does.
+
+    Attributes:
+        step: seconds that a step is shown.
+        every: of so many steps one is drawn.
+    """
+
+    step: float
+    every: int
+
+    @classmethod
+    def of(cls, control_period: float) -> 'Pace':
+        """The pace for steps of so many seconds; 0: unknown."""
+        step = control_period or UNKNOWN_PERIOD
+        return cls(step, max(1, math.ceil(1 / (step * MOST_FRAMES) - 1e-9)))
+
+    @property
+    def rate(self) -> float:
+        """Frames a second."""
+        return 1 / (self.step * self.every)
+
+    @contextmanager
+    def writing(self, file: Path) -> 'Iterator[Callable[[Frame], None]]':
+        """What writes frames to a file."""
+        from imageio_ffmpeg import write_frames
+
+        writer = write_frames(
+            str(file),
+            (WIDTH, HEIGHT),
+            fps=self.rate,
+            macro_block_size=2,
+            output_params=['-v', 'error'],
+        )
+        writer.send(None)
+        try:
+            yield lambda frame: writer.send(frame.tobytes())
+        finally:
+            writer.close()
 
 
 class VideoError(RuntimeError):
@@ -119,7 +163,6 @@ def film(folder: Path, file: Path, settings: 'Settings') -> str:
         TaskError: the task cannot be made or drawn.
     """
     import torch
-    from imageio_ffmpeg import write_frames
 
     from codetr_ros.cli import evaluate
     from codetr_ros.seeding import seed_global
@@ -135,35 +178,25 @@ def film(folder: Path, file: Path, settings: 'Settings') -> str:
     acting = acting_policy(policy, environment, settings)
     assert acting is not None, 'newest_policy gives none that is random'
     runner = EpisodeRunner(environment, settings, 'evaluate')
-    period = environment.control_period or UNKNOWN_PERIOD
-    every = max(1, math.ceil(1 / (period * MOST_FRAMES) - 1e-9))
-    rate = 1 / (period * every)
+    pace = Pace.of(environment.control_period)
     returns: list[float] = []
-    writer = write_frames(
-        str(file), (WIDTH, HEIGHT), fps=rate, macro_block_size=2, output_params=['-v', 'error']
-    )
-    writer.send(None)
     shown = 0
-    with Drawing(environment, WIDTH, HEIGHT) as drawing:
+    with Drawing(environment, WIDTH, HEIGHT) as drawing, pace.writing(file) as put:
         for number in range(settings.evaluate_episodes):
-            if shown >= SECONDS * rate:
+            if shown >= SECONDS * pace.rate:
                 break
-            steps = _episode(runner, settings.seed, number, acting.act)
             total = 0.0
-            for step, reward in enumerate(steps):
+            for step, reward in enumerate(_episode(runner, settings.seed, number, acting.act)):
                 total += reward
-                if step % every == 0 or runner.over:
-                    frame: Frame = drawing.frame()
-                    writer.send(frame.tobytes())
+                if step % pace.every == 0 or runner.over:
+                    put(drawing.frame())
                     shown += 1
             returns.append(total)
-    writer.close()
     many = f'{len(returns)} episode' + 's' * (len(returns) != 1)
     listed = ', '.join(f'{value:.6g}' for value in returns)
-    return (
-        f'{many} after {settings.steps_after(policy.version)} steps, {shown} frames at {rate:.4g} '
-        f'a second, true returns {listed}'
-    )
+    after = f'after {settings.steps_after(policy.version)} steps'
+    frames = f'{shown} frames at {pace.rate:.4g} a second'
+    return f'{many} {after}, {frames}, true returns {listed}'
 
 
 def _episode(

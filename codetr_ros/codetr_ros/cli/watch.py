@@ -4,6 +4,7 @@ import dataclasses
 import os
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -42,11 +43,19 @@ class Arguments:
             metavar='NAME', help='further names of this machine by which browsers may ask'
         ),
     ] = ()
+    video: Annotated[
+        bool | None,
+        tyro.conf.arg(
+            help='draw the newest episode as a video while somebody looks; by default once the '
+            'run is over, since drawing takes processor time'
+        ),
+    ] = None
 
 
 def main(arguments: Sequence[str]) -> int:
     """Serve the page until Ctrl-C; returns the exit code."""
     given = parse_arguments(Arguments, prog='codetr watch', arguments=arguments)
+    from codetr_ros.cli.replayed import EpisodeVideos
     from codetr_ros.config import SettingsError
     from codetr_ros.pages.address import PageError
     from codetr_ros.pages.feed import Feed
@@ -59,12 +68,20 @@ def main(arguments: Sequence[str]) -> int:
     os.nice(NICENESS)
     with Interrupts() as interrupts:
         try:
-            feed = Feed()
-            source = RunSource(folder, run_folder.read_settings(folder), feed)
-            with serve(source, feed, given.host, given.port, given.allow_name) as server:
+            feed, settings = Feed(), run_folder.read_settings(folder)
+            source = RunSource(folder, settings, feed)
+            with (
+                EpisodeVideos(folder, settings, partial(feed.publish, 'video')) as videos,
+                serve(
+                    source, feed, given.host, given.port, given.allow_name, videos.place
+                ) as server,
+            ):
                 console().print(f'watch {folder} at {server.url} (Ctrl-C ends it)')
                 while not interrupts.count:
                     source.poll()
+                    wanted = not source.running if given.video is None else given.video
+                    if wanted and feed.streams:
+                        videos.look(source.recorded)
                     time.sleep(POLL)
                 source.poll()  # how the run ended
         except (RunFolderError, SettingsError, PageError) as error:

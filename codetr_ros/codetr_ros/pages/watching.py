@@ -36,6 +36,7 @@ from codetr_ros.runs import course
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.newest_episode import NewestEpisode
 from codetr_ros.runs.summary import Summary
+from codetr_ros.simulation.replay import Recorded
 from codetr_ros.system.parsing import ParseError, read_json
 
 TAIL = 64 << 20
@@ -74,6 +75,8 @@ class RunSource:
         self._bag: Follower | None = None
         self._episode = NewestEpisode()
         self._shown = 0  # changes of the episode that were published
+        self.recorded: Recorded | None = None
+        """The newest episode as a whole; None if it is not known, as without a bag."""
         self._summary: Summary | None = None  # made of the bag where there is no table
         feed.publish('run', about(folder, settings))
 
@@ -86,10 +89,10 @@ class RunSource:
         if self._changed(table):
             self._read_table(table)
         episode = self._folder / run_folder.EPISODE
-        if self._changed(episode):
-            self._publish_episode(self._read(run_folder.EPISODE))
-        if not (episode.is_file() and table.is_file()):  # the bag has nothing newer
+        if (self._folder / run_folder.BAG).is_dir():
             self._follow_bag(with_tables=not table.is_file())
+        elif self._changed(episode):
+            self._publish_episode(self._read(run_folder.EPISODE))
         self._feed.publish('status', self._status_now())
         self._feed.publish('pictures', self._pictures())
         self._feed.publish('notes', list(self._notes.values()))
@@ -165,11 +168,9 @@ class RunSource:
             self._feed.publish('episode', shown)
 
     def _follow_bag(self, with_tables: bool) -> None:
-        folder = self._folder / run_folder.BAG
-        if not folder.is_dir():
-            return
         if self._bag is None:
-            self._bag = Follower(folder, None if with_tables else TAIL)
+            tail = None if with_tables else TAIL
+            self._bag = Follower(self._folder / run_folder.BAG, tail)
         before = self._summary.phases if self._summary else -1
         for record in self._bag.records((*OF_EPISODES, *OF_TABLES)):
             self._receive(record, with_tables)
@@ -183,6 +184,8 @@ class RunSource:
         if self._episode.changes != self._shown:
             self._shown = self._episode.changes
             self._publish_episode(self._episode.document())
+            arrays = self._episode.arrays()
+            self.recorded = Recorded(*arrays) if arrays else None
         if with_tables and self._summary and self._summary.phases != before:
             self._publish_columns(course.parse(self._summary.metrics_csv().splitlines()))
 
@@ -193,6 +196,11 @@ class RunSource:
             if self._summary is None:
                 self._summary = Summary(self._settings, record.run_id, in_process=False)
             self._summary.receive(record)
+
+    @property
+    def running(self) -> bool:
+        """Whether the run lasts, as far as is known."""
+        return self._status_now().get('state') in ('running', None)
 
     def _pictures(self) -> dict[str, Any]:
         """Names of the pictures that are there, each with when it was made."""
@@ -245,7 +253,12 @@ def _shown(value: Any) -> str:
 
 
 def serve(
-    source: RunSource, feed: Feed, host: str = HERE, port: int = 0, names: Collection[str] = ()
+    source: RunSource,
+    feed: Feed,
+    host: str = HERE,
+    port: int = 0,
+    names: Collection[str] = (),
+    videos: Path | None = None,
 ) -> Server:
     """What serves the page of a run.
 
@@ -255,6 +268,7 @@ def serve(
         host: as that of a `Server`.
         port: as that of a `Server`.
         names: as those of a `Server`.
+        videos: folder of videos of episodes, `<number>.mp4`; None: there are none.
     """
 
     async def picture(request: Request) -> Response:
@@ -263,5 +277,15 @@ def serve(
             return PlainTextResponse('there is no such picture', 404)
         return FileResponse(path)
 
-    routes = [page('/', 'watch.html'), Route('/picture/{name}', picture)]
+    async def video(request: Request) -> Response:
+        path = videos and videos / f'{request.path_params["number"]}.mp4'
+        if path is None or not path.is_file():
+            return PlainTextResponse('there is no such video', 404)
+        return FileResponse(path)
+
+    routes = [
+        page('/', 'watch.html'),
+        Route('/picture/{name}', picture),
+        Route('/video/{number:int}.mp4', video),
+    ]
     return Server(routes, feed, host, port, names)

@@ -41,6 +41,12 @@ class _Parts:
     def steps(self) -> int:
         return max((chunk.first_step + chunk.steps for chunk in self.chunks), default=0)
 
+    def taken(self) -> tuple[F32, F32]:
+        """Observations before the steps (T, O), and actions (T, A)."""
+        observations = {chunk.first_step: chunk.observations[:-1] for chunk in self.chunks}
+        actions = {chunk.first_step: chunk.actions for chunk in self.chunks}
+        return _steps(self.steps, observations), _steps(self.steps, actions)
+
 
 class NewestEpisode:
     """Finds the newest episode that has ended, and prefers one whose steps have labels.
@@ -99,6 +105,22 @@ class NewestEpisode:
                         del self._held[older]
                 return
 
+    def _shown(self) -> tuple[str, int] | None:
+        ended = (key for key in reversed(self._held) if self._held[key].ended)
+        return self._labelled or next(ended, None)
+
+    def arrays(self) -> tuple[str, int, F32, F32] | None:
+        """Source and number of the episode, all observations before its steps (T, O), and all
+        actions (T, A); None if no episode has ended yet, or its first steps are not known.
+        """
+        key = self._shown()
+        if key is None:
+            return None
+        parts = self._held[key]
+        if sum(chunk.steps for chunk in parts.chunks) != parts.steps:
+            return None
+        return (*key, *parts.taken())
+
     def document(self) -> dict[str, Any] | None:
         """The episode for a page: lists of numbers, None where a step has none; None if no episode
         has ended yet.
@@ -113,8 +135,7 @@ class NewestEpisode:
             return None
         parts = self._held[key]
         steps = parts.steps
-        observations = _steps(steps, {c.first_step: c.observations[:-1] for c in parts.chunks})
-        actions = _steps(steps, {c.first_step: c.actions for c in parts.chunks})
+        observations, actions = parts.taken()
         return {
             'source': key[0],
             'episode': key[1],

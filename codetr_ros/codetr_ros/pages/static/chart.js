@@ -102,6 +102,11 @@ export class Chart {
     event.preventDefault();
     const now = this.plot.cursor.idx ?? (moves[event.key] > 0 ? -1 : steps.length);
     const index = Math.min(steps.length - 1, Math.max(0, now + moves[event.key]));
-    this.plot.setCursor({ left: this.plot.valToPos(steps[index], 'x'), top: 10 });
+    this.point(steps[index]);
+  }
+
+  /** Move the cursor to a step. */
+  point(step) {
+    if (this.plot) this.plot.setCursor({ left: this.plot.valToPos(step, 'x'), top: 10 });
   }
 }

@@ -200,9 +200,34 @@ function showPictures(pictures) {
     const shown = video
       ? make('video', { attributes: { src: source, controls: '', loop: '', 'aria-label': name } })
       : make('img', { attributes: { src: source, alt: 'frames of an episode of each policy' } });
-    return make('figure', { children: [shown, make('figcaption', { text: name })] });
+    const words = video ? name : `${name}: an episode of the first, a later and the last policy`;
+    return make('figure', { children: [shown, make('figcaption', { text: words })] });
   });
   at('pictures').replaceChildren(...figures);
+}
+
+function showVideo(given) {
+  const place = at('video');
+  if (!given.file) {
+    write(at('no-video'), `Episode ${given.episode} of ${given.source} is not drawn: ${given.why}`);
+    return;
+  }
+  write(at('no-video'), '');
+  const shown = make('video', {
+    attributes: {
+      src: `/video/${given.file}`, controls: '', loop: '', muted: '', preload: 'auto',
+      'aria-label': `episode ${given.episode} of ${given.source}`,
+    },
+  });
+  shown.muted = true;
+  shown.addEventListener('timeupdate', () => {
+    const step = Math.floor(shown.currentTime / given.step_seconds);
+    for (const chart of [rewards, observations, actions]) chart.point(step);
+  });
+  const words = `Episode ${given.episode} of ${given.source}. The charts follow the video.`;
+  place.replaceChildren(make('figure', {
+    children: [shown, make('figcaption', { text: words })],
+  }));
 }
 
 function showNotes(notes) {
@@ -222,6 +247,7 @@ follow(
     columns: showColumns,
     episode: showEpisode,
     pictures: showPictures,
+    video: showVideo,
     notes: showNotes,
   },
   (state) => {
