@@ -107,11 +107,9 @@ def test_the_charts_follow_the_video_of_the_newest_episode(done, tab: Callable[.
             page.wait_for_selector('#video video', timeout=DEADLINE * 1000)
             page.wait_for_selector('#rewards canvas')
             video = page.locator('#video video')
-            ready = 'one => new Promise(done => { const look = () => '
-            ready += (
-                'one.readyState >= 2 ? done(one.videoWidth) : setTimeout(look, 20); look(); })'
-            )
-            assert video.evaluate(ready) == 640
+            while video.evaluate('one => one.readyState') < 2:  # the first frame is not there
+                page.wait_for_timeout(20)
+            assert video.evaluate('one => one.videoWidth') == 640
             assert video.evaluate('one => one.duration') == pytest.approx(1.0, abs=0.03)
             video.evaluate('one => { one.currentTime = 0.5; }')
             page.wait_for_selector('#rewards .u-series:nth-child(1) .u-value:text-is("25")')

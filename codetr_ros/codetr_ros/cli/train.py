@@ -194,7 +194,7 @@ def train(
     recorded_before = True if begun is not None else None
     summary = Summary(settings, run_id, in_process, command=command, recorded=recorded_before)
     progress = Progress(settings)
-    live = Live(folder, summary, progress, namespace)
+    live = Live(folder, summary, progress, namespace, recorded=bag or not in_process)
     progress.log(
         f'{settings.task}: {settings.composite} of {config.delay_in_words(settings.delay)}, '
         f'method {settings.method}, {settings.steps} steps, seed {settings.seed}'

@@ -1,9 +1,8 @@
 """What there is to see of a run, from its folder: while it lasts, later, or of a copy of it.
 
-Nothing in the folder is changed. What a run in process shows comes from `status.json`,
-`metrics.csv` and `newest_episode.json`; what nodes show comes from their bag too. A run whose
-nodes were started by hand or by a launch file has no files but the bag until `codetr report` makes
-them.
+Nothing in the folder is changed. What is shown comes from `status.json`, `metrics.csv` and the
+bag, or `newest_episode.json` where there is none. A run whose nodes were started by hand or by a
+launch file has nothing but the bag until `codetr report` makes the rest.
 """
 
 import time

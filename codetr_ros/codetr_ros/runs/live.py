@@ -1,5 +1,5 @@
-"""What a run leaves while it lasts, for whoever looks: `status.json`, `metrics.csv` and, in
-process, `newest_episode.json`.
+"""What a run leaves while it lasts, for whoever looks: `status.json`, `metrics.csv` and, where no
+bag is recorded, `newest_episode.json`.
 
 Each file is written whole, at most once a second, and so rarely that all of it takes at most one
 part in 200 of the run's time. Nothing reads them but people and pages.
@@ -50,6 +50,7 @@ class Live:
         progress: receives the same records; logs why nothing is written.
         namespace: that of the nodes; None: the run is in process.
         clock: seconds, never going back.
+        recorded: whether a bag has the episodes too.
     """
 
     def __init__(
@@ -59,6 +60,7 @@ class Live:
         progress: Progress,
         namespace: str | None = None,
         clock: Callable[[], float] = time.monotonic,
+        recorded: bool = False,
     ) -> None:
         self._folder = folder
         self._summary = summary
@@ -69,7 +71,7 @@ class Live:
         self._changed = False  # a number of metrics.csv
         self._nodes: dict[str, dict[str, Any]] = {}
         self._parts: Mapping[str, tuple[str, Part]] = {}
-        self._episode = NewestEpisode() if summary.in_process else None
+        self._episode = NewestEpisode() if summary.in_process and not recorded else None
         self._shown = 0  # changes of the episode that were written
         self._broken = False
         # of a run that goes on: its summary has what comes from now on
