@@ -65,6 +65,7 @@ class Plan:
         disk: what is wrong with the recorder's disk.
         heals: whether the run must end as if nothing had happened; else it may also end by an
             error that names its cause.
+        leave_out_after: seconds of silence after which a source is left out of a phase; 0: never.
     """
 
     seed: int
@@ -73,6 +74,7 @@ class Plan:
     paces: dict[str, Pace]
     disk: Trouble = field(default_factory=Trouble)
     heals: bool = True
+    leave_out_after: float = 0.0
 
     @property
     def calm(self) -> bool:
@@ -124,6 +126,8 @@ class Plan:
             lines.append(f'the disk of the recorder has room for {self.disk.room} bytes')
         if self.disk.syncs is not None:
             lines.append(f'the disk of the recorder syncs {self.disk.syncs} times')
+        if self.leave_out_after:
+            lines.append(f'who is silent for {self.leave_out_after:.1f} s is left out')
         lines.append('must end as if nothing had happened' if self.heals else 'may fail by name')
         return lines
 

@@ -5,7 +5,7 @@ what is missing, work one slice, publish what came out.
 """
 
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -108,6 +108,7 @@ class Process:
         core: its core.
         error: why it gave up; None if it has not.
         ended: whether it has taken its last turn.
+        when_ended: called once it has.
         repeated: second copies that it has taken, by topic.
 
     Args:
@@ -120,6 +121,7 @@ class Process:
         core: its core.
         pace: how quickly it works.
         deadline: how long it waits for others [s].
+        instance: which start of the node this is: 1, 2, ...
     """
 
     def __init__(
@@ -133,9 +135,12 @@ class Process:
         core: Core[Record],
         pace: Pace,
         deadline: float,
+        instance: int = 1,
     ) -> None:
+        self.instance = instance
         self.role, self.name, self.core = role, name, core
         self.error: Exception | None = None
+        self.when_ended: Callable[[Process], None] = lambda process: None
         self.ended = False
         self.finished = False  # the core was, when it ended
         self.repeated: Counter[str] = Counter()
@@ -291,7 +296,7 @@ class Process:
             run_id=self.run.run_id,
             role=self.role,
             node=f'/{self.name}',
-            instance_id=self.name,
+            instance_id=f'{self.name}#{self.instance}',
             settings_hash='' if self.error else self.run.settings_hash,
             finished=self.ended,
             topics=topics,
@@ -313,3 +318,4 @@ class Process:
         self.world.note(self.name, 'has finished' if self.finished else f'fails: {self.error}')
         self.core.close()
         self.publish_presence()
+        self.when_ended(self)

@@ -12,6 +12,7 @@ from codetr_ros.cores.beside import Beside, Early
 from codetr_ros.cores.recorder import Recorder
 from codetr_ros.nodes.last_phases import LastPhases
 from codetr_ros.nodes.settling import Settling, still_missing
+from codetr_ros.nodes.silence import silent_sources
 from codetr_ros.records import TOPICS, Commit, Presence, Record, RunSpec, TaskSpec
 from codetr_ros.records.fields import type_name
 from codetr_ros.records.roles import published_by
@@ -26,10 +27,19 @@ CHUNK_BYTES = 2048
 class Recording(Process):
     """The recorder: writes what arrives, and publishes a commit once it is on the disk."""
 
-    def __init__(self, *given: Any, folder: Path, disk: TroubledDisk, settings: Settings) -> None:
+    def __init__(
+        self,
+        *given: Any,
+        folder: Path,
+        disk: TroubledDisk,
+        settings: Settings,
+        leave_out_after: float,
+    ) -> None:
         super().__init__(*given)
         self.disk = disk
         self.recorded: Counter[str] = Counter()
+        self.history: list[tuple[type, bytes]] = []  # what the bag holds, in its order
+        self._settings_of_run, self._leave_out_after = settings, leave_out_after
         self._full = {kind: f'/run/{TOPICS[kind]}' for kind in RECORDED}
         topics = [BagTopic(self._full[kind], type_name(kind), 16, False) for kind in RECORDED]
         self._bag = McapWriter(folder, topics, CHUNK_BYTES, keep_free=0, disk=disk)
@@ -43,6 +53,7 @@ class Recording(Process):
     def _write(self, kind: type, raw: bytes) -> None:
         self._bag.write(self._full[kind], raw, round(self.world.now * 1e9))
         self.recorded[TOPICS[kind]] += 1
+        self.history.append((kind, raw))
 
     def take(self, kind: type, raw: bytes) -> None:
         """Take the bytes of a message: what is admitted is written as it came."""
@@ -87,6 +98,13 @@ class Recording(Process):
         self._bag.flush()
         self._last.commit(record, raw)
         self.publish(record, raw)
+
+    def _do_turn(self) -> float | None:
+        now = self.world.now
+        silent = silent_sources(self.peers, self._settings_of_run, now, self._leave_out_after)
+        for source in cast(Recorder, self.core).leave_out(silent):
+            self.world.note(self.name, f'leaves {source} out')
+        return super()._do_turn()
 
     def settled(self, seconds: float) -> bool:
         """Whether all nodes have finished and all their records are in the bag."""

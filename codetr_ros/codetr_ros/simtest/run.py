@@ -4,22 +4,25 @@ import logging
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import Any, cast
 
 import torch
 
+from codetr_ros.bags.definitions import decode
 from codetr_ros.config import Settings
 from codetr_ros.cores import in_process
 from codetr_ros.cores.core import Core
 from codetr_ros.cores.evaluator import Evaluator
 from codetr_ros.cores.labeller import Labeller
 from codetr_ros.cores.learner import Learner
+from codetr_ros.cores.left_out import LeftOutError, undropped
 from codetr_ros.cores.recorder import Recorder
 from codetr_ros.cores.simulator import Simulator
 from codetr_ros.nodes import errors
-from codetr_ros.records import Record, RunSpec
+from codetr_ros.records import Commit, Policy, Record, RunSpec
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.simtest import checks
 from codetr_ros.simtest.disks import TroubledDisk
@@ -27,9 +30,11 @@ from codetr_ros.simtest.mail import Post
 from codetr_ros.simtest.plan import DEADLINE, Plan, names_of, plan
 from codetr_ros.simtest.process import Process
 from codetr_ros.simtest.recording import Recording
+from codetr_ros.simtest.replay import replayed
 from codetr_ros.simtest.world import World
 
 RUN_ID = 'simtest'
+START_SECONDS = 1.0  # that a node takes to start again
 
 
 @dataclass(frozen=True)
@@ -100,25 +105,23 @@ class Simulated:
         self.plan = planned
         self.folder = folder
         self.world = World(planned.seed, kept)
-        self.disk = TroubledDisk(planned.disk)
+        self.disk = TroubledDisk(replace(planned.disk))
         self.post = Post(self.world, planned.weather)
         run = settings.run_spec(RUN_ID)
         self.processes: dict[str, Process] = {}
         self.failures: list[str] = []
+        self._starting = 0  # nodes that will be there in a moment
         for name, role in names_of(settings).items():
             common = (
                 self.world, self.post, run, settings, role, name,
                 core_of(role, name, run, settings), planned.paces[name], DEADLINE,
             )  # fmt: skip
             try:
-                made = (
-                    Recording(*common, folder=folder, disk=self.disk, settings=settings)
-                    if role == 'record'
-                    else Process(*common)
-                )
+                made = self._record(common) if role == 'record' else Process(*common)
             except Exception as error:  # noqa: BLE001 - a disk that is full from the beginning
                 made = Process(*common)
                 made.error = error
+            made.when_ended = self._start_again
             self.processes[name] = made
         self.post.processes = self.processes
         self.post.watch = self._watch
@@ -126,12 +129,63 @@ class Simulated:
             if each.error is not None:
                 each.end()
 
+    def _record(self, common: tuple[Any, ...]) -> Recording:
+        return Recording(
+            *common,
+            folder=self.folder,
+            disk=self.disk,
+            settings=self.plan.settings,
+            leave_out_after=self.plan.leave_out_after,
+        )
+
+    def _start_again(self, ended: Process) -> None:
+        """Start a simulator again that was left out, as its launcher would."""
+        if isinstance(ended.error, LeftOutError):
+            self._starting += 1
+            self.world.at(self.world.now + START_SECONDS, lambda: self._restarted(ended))
+
+    def _restarted(self, ended: Process) -> None:
+        self._starting -= 1
+        settings, name = self.plan.settings, ended.name
+        core = Simulator(ended.run, settings, name)
+        there = [decode(kind, raw) for kind, raw in self.recording.history]
+        for record in undropped(there):
+            core.restore(record)
+        due = cast(Recorder, self.recording.core).phase
+        core.resume(due)
+        for record in there:
+            if isinstance(record, Policy) and record.phase >= due:
+                core.receive(record)
+        pace = replace(self.plan.paces[name], begins=self.world.now)
+        again = Process(
+            self.world, self.post, ended.run, settings, 'sim', name, core, pace, DEADLINE,
+            ended.instance + 1,
+        )  # fmt: skip
+        again.when_ended = self._start_again
+        self.processes[name] = again
+        self.world.note(name, f'starts again, behind phase {due - 1}')
+
     @property
     def recording(self) -> Recording:
         """The recorder."""
         recording = self.processes['record']
         assert isinstance(recording, Recording)
         return recording
+
+    def dropped(self) -> list[str]:
+        """The sources that were left out, once for each phase."""
+        there = (decode(kind, raw) for kind, raw in self.recording.history)
+        return [source for each in there if isinstance(each, Commit) for source in each.dropped]
+
+    def expected(self) -> Digests:
+        """The weights that the run must end with: those of the undisturbed one or, where sources
+        were left out, those that learn again from what was recorded.
+        """
+        settings = self.plan.settings
+        if not self.dropped():
+            return undisturbed(settings.canonical())
+        there = [decode(kind, raw) for kind, raw in self.recording.history]
+        return Digests(*replayed(settings.run_spec(RUN_ID), settings, there))
 
     def _watch(self, kind: type, raw: bytes, reader: Process) -> None:
         """Look at what arrives at a consumer."""
@@ -142,7 +196,10 @@ class Simulated:
         """Let it happen, and judge it."""
         processes = self.processes.values()
         over = self.world.run(
-            self.plan.longest, lambda: bool(self.failures) or all(p.ended for p in processes)
+            self.plan.longest,
+            lambda: (
+                bool(self.failures) or (not self._starting and all(p.ended for p in processes))
+            ),
         )
         for each in processes:
             each.core.close()

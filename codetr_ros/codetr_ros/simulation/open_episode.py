@@ -23,7 +23,8 @@ class DiffersError(ValueError):
 
 
 class OpenEpisode:
-    """Takes the records of a source in their order; holds those of the episode that is under way.
+    """Takes the records of a source, each kind in its order; holds those of the episode that is
+    under way. True rewards and scores may come before their steps: topics overtake each other.
 
     Args:
         settings: of the run.
@@ -51,24 +52,35 @@ class OpenEpisode:
         if isinstance(record, Transitions):
             self._take_chunk(record)
         elif isinstance(record, TrueRewards):
-            if self._chunks and record.episode == self.episode:
+            if self._open(record.episode):
                 self._rewards[record.sequence] = record
         elif isinstance(record, CompositeReward):
             self.scores = record.sequence + 1
             self.counters.update({'scores': 1, 'scores missing': int(math.isnan(record.value))})
-            if record.episode == self.episode and self._chunks:
+            if self._open(record.episode):
                 self._scores.append(record)
+
+    def _open(self, episode: int) -> bool:
+        """Whether an episode is under way, or still to begin."""
+        return episode > self.episode or (episode == self.episode and bool(self._chunks))
 
     def _take_chunk(self, chunk: Transitions) -> None:
         if chunk.first_step == 0:
-            self._chunks, self._rewards, self._scores = [], {}, []
+            self._chunks = []
+            self._forget(chunk.episode)
         self._chunks.append((chunk, self._taken[chunk.phase]))
         self._taken[chunk.phase] += chunk.steps
         self.episode, self.sequence = chunk.episode, chunk.sequence + 1
         self.counters.update(chunks=1, steps=chunk.steps)
         if chunk.terminated or chunk.truncated:
             self._chunks = []
+            self._forget(chunk.episode + 1)
             self.counters['episodes'] += 1
+
+    def _forget(self, episode: int) -> None:
+        """Forget what is of episodes before one."""
+        self._rewards = {n: r for n, r in self._rewards.items() if r.episode >= episode}
+        self._scores = [score for score in self._scores if score.episode >= episode]
 
     @property
     def steps(self) -> int:
@@ -131,7 +143,7 @@ class OpenEpisode:
             The score of the segment that is cut short, and what the scorer gives; nothing if none
             is, or if not all rewards are recorded.
         """
-        if len(self._rewards) < len(self._chunks):
+        if any(chunk.sequence not in self._rewards for chunk, _ in self._chunks):
             runner.length, runner.truncated = -1, True
             return
         parts = [self._rewards[chunk.sequence].rewards for chunk, _ in self._chunks]
