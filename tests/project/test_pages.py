@@ -141,6 +141,7 @@ def test_the_page_on_ros_names_every_parameter_of_the_nodes_with_its_default():
     from codetr_ros.ros.parameters import own_parameters
 
     roles = {'learner': 'learner', 'reward': 'reward', 'record': 'recorder', 'sim': ''}
+    roles |= {'robot': 'robot'}
     rows = re.findall(
         r'^\| (\w+) \| `(\w+)` \| (.*?) ?\|', ros_section('Parameters'), re.MULTILINE
     )
@@ -206,6 +207,19 @@ def test_the_spec_and_the_mapping_that_pages_show_are_accepted(tmp_path: Path):
     for part in parts:
         file.write_text(yaml.safe_dump(whole | part))
         assert mapping.load(file).score.of == part['score'].get('of', 'since_last')
+
+
+def test_the_mapping_that_the_page_on_live_robots_shows_is_accepted(tmp_path: Path):
+    from codetr_ros.robots import mapping
+
+    shown = mapping.load(quoted_yaml('docs/your-robot.md', tmp_path)[0])
+    used = mapping.load(ROOT / 'examples/robot_arm/live.yaml')
+    assert shown.live is not None
+    assert used.live is not None
+    assert shown.live.size(shown.action.low, shown.action.high, 0) == 2
+    shown_parts = shown.live.model_fields_set
+    assert shown_parts == set(type(shown.live).model_fields)  # each entry is explained
+    assert (used.live.rate, used.live.command) == (shown.live.rate, shown.live.command)
 
 
 def test_the_readme_is_one_page():
