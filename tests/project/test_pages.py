@@ -13,6 +13,7 @@ import yaml
 
 from codetr_ros.cli import COMMANDS, main
 from codetr_ros.config import load
+from codetr_ros.processes import launcher
 from codetr_ros.records import TOPICS
 from codetr_ros.records.roles import TABLE
 
@@ -166,9 +167,10 @@ def ros_section(title: str) -> str:
 
 def test_the_nodes_and_parameters_that_pages_start_exist():
     known = {(role.package, role.executable) for role in TABLE.values()}
+    known |= {('sim_node', launcher.ROBOT_NODE)}  # in place of a simulator
     settings = set(load('paper').flat())
     own = {'run_id', 'folder', 'peer_deadline', 'config', 'checkpoint', 'frozen'}
-    own |= {'bag', 'bag_split_mb', 'bag_keep_free_mb'}
+    own |= {'bag', 'bag_split_mb', 'bag_keep_free_mb', 'mapping', 'autostart'}
     for page, command in QUOTED:
         if match := re.match(r'ros2 run (\w+) (\w+)', command):
             assert (match[1], match[2]) in known, (page, command)
