@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 
+from codetr_ros import cli
 from codetr_ros.bags.topics import BagTopic
 from codetr_ros.bags.writer import McapWriter
 from codetr_ros.config import Settings
@@ -206,19 +207,21 @@ def test_a_file_that_cannot_be_read_is_named_and_the_rest_is_shown(run: Run, tab
         assert 'newest_episode.json' in page.inner_text('#notes')
 
 
-@pytest.mark.parametrize('scheme', ['light', 'dark'])
-def test_the_page_fits_400_pixels(run: Run, tab, scheme: str):
+def test_the_page_fits_400_pixels(run: Run, tab):
     run.take(*table_records(), *EPISODE)
     with served(run.folder) as (server, _):
-        page = tab(server.url, width=NARROW, color_scheme=scheme)
+        page = tab(server.url, width=NARROW)
         page.wait_for_selector('#rewards canvas')
-        assert page.evaluate('document.documentElement.scrollWidth') <= NARROW
-        wide = page.evaluate(
-            """[...document.querySelectorAll('body *')].filter(one =>
-                 !one.closest('.scroll') && one.offsetParent
-                 && one.getBoundingClientRect().right > innerWidth + 1).map(one => one.id)"""
-        )
-        assert wide == []
+        for scheme in ('light', 'dark'):  # which draws the charts anew
+            page.emulate_media(color_scheme=scheme)
+            page.wait_for_selector('#rewards canvas')
+            assert page.evaluate('document.documentElement.scrollWidth') <= NARROW
+            wide = page.evaluate(
+                """[...document.querySelectorAll('body *')].filter(one =>
+                     !one.closest('.scroll') && one.offsetParent
+                     && one.getBoundingClientRect().right > innerWidth + 1).map(one => one.id)"""
+            )
+            assert wide == []
 
 
 def test_the_page_is_used_by_keys_alone(run: Run, tab):
@@ -307,11 +310,9 @@ def test_the_command_prints_its_address_and_ends_with_ctrl_c(run: Run, tab):
         started.communicate()
 
 
-def test_a_folder_of_no_run_is_refused(tmp_path: Path):
-    done = program('watch', str(tmp_path))
-    _, said = done.communicate(timeout=60)
-    assert done.returncode == 2
-    assert 'is not the folder of a run' in said
+def test_a_folder_of_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert cli.main(['watch', str(tmp_path)]) == cli.USAGE
+    assert 'is not the folder of a run' in capsys.readouterr().err
 
 
 @pytest.mark.slow

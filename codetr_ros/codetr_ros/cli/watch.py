@@ -65,10 +65,10 @@ def main(arguments: Sequence[str]) -> int:
     from codetr_ros.runs.folder import RunFolderError
 
     folder = Path(given.run_dir)
-    os.nice(NICENESS)
     with Interrupts() as interrupts:
         try:
             feed, settings = Feed(), run_folder.read_settings(folder)
+            os.nice(NICENESS)
             source = RunSource(folder, settings, feed)
             with (
                 EpisodeVideos(folder, settings, partial(feed.publish, 'video')) as videos,
