@@ -12,6 +12,7 @@ from codetr_ros.records import (
     CompositeReward,
     Policy,
     RunSpec,
+    ScoreRequest,
     StepRewards,
     TaskSpec,
     Transitions,
@@ -203,3 +204,20 @@ def same(a: Any, b: Any) -> bool:
         elif x != y:
             return False
     return True
+
+
+def score_request(firsts=(0,), length=7, **changes: Any) -> ScoreRequest:
+    """For segments of one episode of 'sim' that begin with these steps."""
+    count = len(firsts)
+    return replace(
+        ScoreRequest(
+            run_id='run',
+            phase=0,
+            sources=('sim',) * count,
+            episodes=np.zeros(count, np.uint32),
+            first_steps=np.array(firsts, np.uint32),
+            lengths=np.full(count, length, np.uint32),
+            worths=np.full(count, np.nan, np.float32),
+        ),
+        **changes,
+    )

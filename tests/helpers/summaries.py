@@ -120,10 +120,10 @@ def built(**changes: Any) -> dict[str, Any]:
     return run_summary(**changes).model_dump(mode='json')
 
 
-def run_summary(**changes: Any) -> RunSummary:
+def run_summary(*more: Record, **changes: Any) -> RunSummary:
     clock = Clock()
     made = Summary(SETTINGS, 'r', in_process=False, clock=clock)
-    for record in a_run():
+    for record in (*a_run(), *more):
         made.receive(record)
     clock.now += 50
     return made.build(REPORTS, **changes)

@@ -13,6 +13,7 @@ from helpers.builders import (
     policy,
     run,
     score,
+    score_request,
     step_rewards,
     task_spec,
     transitions,
@@ -74,6 +75,13 @@ def test_what_no_run_has_is_refused_naming_field_value_and_bound(record, why):
     assert why in str(refused.value)
     assert len(str(refused.value)) < 500
     assert str(refused.value).isprintable()
+
+
+def test_a_request_may_name_a_source_for_each_segment_and_a_node_may_wait_for_many():
+    check_bounds(score_request(firsts=(0, 7, 14)))
+    check_bounds(replace(PRESENCE, doing='waits for ' + 'a node; ' * 200))
+    with pytest.raises(RecordError, match='Presence.doing is .* at most 4096 characters'):
+        check_bounds(replace(PRESENCE, doing='x' * 4097))
 
 
 def test_what_is_shown_is_neither_endless_nor_able_to_forge_a_line():

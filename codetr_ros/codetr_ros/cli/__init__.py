@@ -20,6 +20,7 @@ commands:
   convert    make a bag for `fit` from ordinary topics, by a mapping file
   report     make the report of a run, however it was started, or of a benchmark
   watch      show a run in the browser, while it lasts or later
+  score      score the segments of a run in the browser
   evaluate   evaluate the policy of a run's newest checkpoint
   replay     derive a run's weights again from its bag, and compare them
   benchmark  do many runs under one protocol, and make a table of them
@@ -68,6 +69,12 @@ def _report(arguments: Sequence[str]) -> int:
     from codetr_ros.cli import report
 
     return report.main(arguments)
+
+
+def _score(arguments: Sequence[str]) -> int:
+    from codetr_ros.cli import score
+
+    return score.main(arguments)
 
 
 def _watch(arguments: Sequence[str]) -> int:
@@ -127,6 +134,7 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     'report': _report,
     'watch': _watch,
     'replay': _replay,
+    'score': _score,
     'benchmark': _benchmark,
     'bag': _bag,
     'demo': _demo,

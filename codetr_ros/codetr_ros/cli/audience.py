@@ -1,5 +1,6 @@
 """Who receives the records of a run that `codetr train` does: all of it, in one place."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from codetr_ros.cli.beside import Beside
@@ -20,7 +21,7 @@ class Audience:
         progress: shows how far the run has come.
         live: writes the files that change while the run lasts.
         events: writes TensorBoard's events; None: nobody asked for them.
-        page: serves the page of the run; None: nobody asked for it.
+        pages: serve pages of the run.
         middle: keeps the policy of the middle of the run; None: nobody draws it.
     """
 
@@ -28,7 +29,7 @@ class Audience:
     progress: Progress
     live: Live
     events: Events | None = None
-    page: Beside | None = None
+    pages: Sequence[Beside] = ()
     middle: Middle | None = None
 
     def receive(self, record: Record) -> None:
@@ -43,8 +44,8 @@ class Audience:
         """Show what has changed, where it is time. Call it now and then."""
         self.progress.tick()
         self.live.tick()
-        if self.page is not None:
-            self.page.tick()
+        for page in self.pages:
+            page.tick()
         if self.middle is not None:
             self.middle.look(self.summary.phases)
 

@@ -7,15 +7,14 @@ import secrets
 import shlex
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from codetr_ros import config
-from codetr_ros.cli import FAILED, INTERRUPTED, refuse, results, resume, train_in_process
+from codetr_ros.cli import FAILED, INTERRUPTED, beside, refuse, results, resume, train_in_process
 from codetr_ros.cli.audience import Audience
-from codetr_ros.cli.beside import Beside
 from codetr_ros.cli.flags import parse
 from codetr_ros.cli.outcome import Outcome
 from codetr_ros.cli.terminal import console
@@ -104,6 +103,11 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
         if in_process:
             # before torch is imported: the threads of the nodes, for the same results bit for bit
             os.environ.update(threading_environment(settings))
+        if in_process and settings.scorer in ('person', 'topic'):
+            return refuse(
+                f'--scorer {settings.scorer} with --in-process: scores come over topics, which it '
+                'does without; leave out --in-process, or take --scorer simulated'
+            )
         tasks.check(settings, tasks.find(settings.task))
         if not in_process:
             for role in settings.roles:
@@ -211,10 +215,12 @@ def train(
     events = None
     if shown.tensorboard:
         events = Events(folder / run_folder.TENSORBOARD, settings, progress.log)
-    page = Beside(folder, progress.log) if shown.watch else None
+    pages = beside.pages(folder, settings, progress.log, shown.watch, namespace)
     middle = Middle(folder, settings, progress.log) if shown.film else None
-    audience = Audience(summary, progress, live, events, page, middle)
-    with Interrupts() as interrupts, page or nullcontext():
+    audience = Audience(summary, progress, live, events, pages, middle)
+    with Interrupts() as interrupts, ExitStack() as open_pages:
+        for page in pages:
+            open_pages.enter_context(page)
         with progress:
             way = (
                 partial(train_in_process.run, bag=bag, resumed=begun is not None)

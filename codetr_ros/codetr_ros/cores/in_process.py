@@ -32,6 +32,9 @@ from codetr_ros.runs.reports import NodeReport
 Attend = Callable[[Mapping[str, tuple[str, Core[Record]]]], None]
 """Takes the parts of a run, each with its role by its name, before they begin."""
 
+MakeScorer = Callable[[RunSpec, Settings], Core[Record]]
+"""Makes the part that scores, where others than the simulator do."""
+
 
 @dataclass
 class Member:
@@ -54,6 +57,7 @@ class Parts:
         folder: where checkpoints and reports go; None: neither is written.
         observe: called with every record, in order.
         tick: called after every slice of work.
+        scorer: makes who scores; None: simulated people, where the settings name them.
     """
 
     def __init__(
@@ -63,6 +67,7 @@ class Parts:
         folder: Path | None,
         observe: Callable[[Record], None],
         tick: Callable[[], None],
+        scorer: MakeScorer | None = None,
     ) -> None:
         self.settings = settings
         self.spec: RunSpec = settings.run_spec(run_id)
@@ -77,7 +82,9 @@ class Parts:
         self.simulators = {
             name: Simulator(spec, settings, name) for name in settings.simulator_names
         }
-        self.people = SimulatedPeople(spec, settings) if settings.scorer == 'simulated' else None
+        if scorer is None and settings.scorer == 'simulated':
+            scorer = SimulatedPeople
+        self.people = None if scorer is None else scorer(spec, settings)
         self.recorder = Recorder(spec, settings, 'record')
         self.reward = (
             Labeller(spec, settings, 'reward', checkpoints) if settings.labels_steps else None
@@ -201,6 +208,7 @@ def run(
     tick: Callable[[], None] = lambda: None,
     attend: Attend = lambda cores: None,
     bag: bool = False,
+    scorer: MakeScorer | None = None,
 ) -> dict[str, NodeReport]:
     """Run Algorithm 1 to its end.
 
@@ -213,6 +221,7 @@ def run(
         tick: called after every slice of work; an error that it raises does the same.
         attend: called with the parts, each with its role by its name, before they begin.
         bag: record the run in the folder's bag.
+        scorer: makes who scores; None: simulated people, where the settings name them.
 
     Returns:
         A report for each part of the run, as the nodes write them.
@@ -223,7 +232,7 @@ def run(
     """
     settings = settled(settings)
     torch.set_num_threads(settings.thread_count)
-    parts = Parts(settings, run_id, folder, observe, tick)
+    parts = Parts(settings, run_id, folder, observe, tick, scorer)
     if bag and folder is not None:
         parts.bag = RunBag(folder / run_folder.BAG, settings, namespace_of(run_id))
     attend(parts.cores)

@@ -20,6 +20,7 @@ from codetr_ros.records.kinds import (
     Record,
     RecordError,
     RunSpec,
+    ScoreRequest,
     TaskSpec,
 )
 from codetr_ros.records.roles import ROLES
@@ -29,9 +30,12 @@ LONGEST_NAME = 255
 """The most characters of a name: of a run, a node, a source, a task, a metric."""
 MOST_NAMES = 10_000
 """The most names in a list: sources, scorers, metrics."""
+LONGEST_DOING = 4096
+"""The most characters of what a node does, in words: it may wait for many others."""
 LONGEST_TEXT: dict[tuple[type, str], int] = {
     (RunSpec, 'settings'): 1 << 20,
     (Policy, 'network'): 1 << 16,
+    (Presence, 'doing'): LONGEST_DOING,
 }
 """The most characters of texts that are no names."""
 LARGEST_COUNT = 1 << 48
@@ -108,7 +112,7 @@ def _check_text(kind: type, name: str, text: str, most: int = LONGEST_NAME) -> N
 def _check_list(kind: type, name: str, names: tuple[str, ...]) -> None:
     if len(names) > MOST_NAMES:
         raise _refused(kind, name, names[:3], f'at most {MOST_NAMES} names, not {len(names)}')
-    if kind is not Metrics and len(set(names)) != len(names):
+    if kind not in (Metrics, ScoreRequest) and len(set(names)) != len(names):
         raise _refused(kind, name, names[:10], 'names of which none comes twice')
     for each in names:
         _check_text(kind, name, each)

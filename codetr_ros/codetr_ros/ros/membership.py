@@ -23,6 +23,7 @@ from codetr_ros.records import (
     RunSpec,
     describe,
 )
+from codetr_ros.records.bounds import LONGEST_DOING
 from codetr_ros.records.roles import published_by
 from codetr_ros.ros import given, link, parameters
 from codetr_ros.ros.fetch import Fetcher
@@ -299,7 +300,7 @@ class Membership:
                 topics=topics,
                 published=np.array([self.link.published[t] for t in topics], np.uint64),
                 missed=sum(counters['lost'].values()),
-                doing='has finished' if finished else self.doing,
+                doing='has finished' if finished else self.doing[:LONGEST_DOING],
                 waiting=self._waiting(finished),
             )
         )

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from codetr_ros.runs import course, document, pictures, references, segments
+from codetr_ros.runs import course, document, pictures, references, scorers, segments
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.document import (
     Block,
@@ -141,6 +141,7 @@ def page(summary: RunSummary, picture: bytes, material: Material | None = None) 
         *_film(given),
         Heading('Evaluations'),
         _evaluations(summary),
+        *scorers.blocks(summary),
         *_recovery(summary, given.segments),
         *_training(summary, given.columns),
         *origin(summary, given.files),

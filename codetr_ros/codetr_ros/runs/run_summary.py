@@ -71,6 +71,24 @@ class MessageCounts(Facts):
     refused: int = Field(description='that a node refused')
 
 
+class ScorerRow(Facts):
+    """What was known at the end of somebody who scored, where others than the simulator did."""
+
+    scores: int = Field(description='segments in the memory that had a score of it')
+    preferences: int = Field(description='pairs of segments in the memory that it had compared')
+    offset: float | None = Field(
+        description='a score of it is offset + slope * worth, on the scale of the first scorer'
+    )
+    slope: float | None = Field(description='see offset')
+    noise: float | None = Field(
+        description='standard deviation of its scores about that; null with a single scorer'
+    )
+    agreement: float | None = Field(
+        description="correlation with the mean of the others' scores of the same segments; null "
+        'where they share too few'
+    )
+
+
 class ProcessUse(Facts):
     """The resources that a process used, and how it ended; null if not known."""
 
@@ -142,6 +160,9 @@ class RunSummary(Facts):
     lost: int = Field(description='lost messages, all topics together')
     duplicated: int = Field(description='duplicated messages, all topics together')
     refused: int = Field(description='refused messages, all topics together')
+    scorers: dict[str, ScorerRow] = Field(
+        {}, description='who scored, by name, where others than the simulator did'
+    )
     bag: str | None = Field(description="folder of the run's bag; null without one")
     processes: dict[str, ProcessUse] = Field(
         description='resources that each process used, by `<role>-<name>` of its node'

@@ -20,7 +20,7 @@ from pydantic import JsonValue
 from codetr_ros.config import Settings
 from codetr_ros.records import Commit, EpisodeResult, Metrics, Record
 from codetr_ros.runs import folder as run_folder
-from codetr_ros.runs import run_summary, segments
+from codetr_ros.runs import run_summary, scorers, segments
 from codetr_ros.runs.recovery import Recovery
 from codetr_ros.runs.reports import NodeReport
 from codetr_ros.runs.run_summary import Evaluation, RewardRecovery, RunSummary
@@ -269,6 +269,12 @@ class Summary:
             lost=sum(row.lost for row in messages.values()),
             duplicated=sum(row.duplicated for row in messages.values()),
             refused=sum(row.refused for row in messages.values()),
+            scorers=scorers.rows(
+                (name, value)
+                for _, values in sorted(self._metrics.items())
+                for (role, _, name), value in values.items()
+                if role == 'reward'
+            ),
             # where it is now: the folder may have been moved since the recorder wrote it
             bag=str(bag) if bag else _first(r.bag for r in of_role('record')),
             processes=processes(reports),

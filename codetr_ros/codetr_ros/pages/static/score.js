@@ -1,0 +1,227 @@
+// The page on which a person scores segments: by clicks and by keys.
+import { Chart } from './chart.js';
+import { at, follow, make, number, send, write } from './page.js';
+
+const KEYS = 'Keys: the points themselves, = same as before, x can\'t tell, s later, c compare.';
+const FRAME_MS = 100;
+const state = { scale: [1, 5], desk: null, later: [], shown: [], correcting: null, last: null,
+  comparing: false, busy: false };
+
+const same = (one, other) => JSON.stringify(one) === JSON.stringify(other);
+
+function words([source, episode, first, length]) {
+  return `${source}, episode ${episode}, steps ${first} to ${first + length - 1}`;
+}
+
+/** Shows one segment: its pictures if it can be drawn, else its curves. */
+class Shown {
+  constructor(element, title) {
+    this.segment = null;
+    this.element = element;
+    this.title = make('h3', { text: title });
+    this.picture = make('img', { className: 'frames', attributes: { alt: '' } });
+    this.picture.hidden = true;
+    const observations = make('div');
+    const actions = make('div');
+    element.append(this.title, this.picture, observations, actions);
+    this.observations = new Chart(observations, 'what the robot saw', { xLabel: 'step', height: 160 });
+    this.actions = new Chart(actions, 'what it did', { xLabel: 'step', height: 120 });
+    this.timer = null;
+  }
+
+  async show(segment) {
+    if (same(segment, this.segment)) return;
+    this.segment = segment;
+    clearInterval(this.timer);
+    this.picture.hidden = true;
+    const curves = await send('/segment', { segment });
+    if (!same(segment, this.segment)) return;
+    const curve = (name) => (values, i) => ({
+      name: `${name} ${i + 1}`,
+      steps: values.map((_, t) => curves.first + t * curves.every),
+      values,
+    });
+    this.observations.show(curves.observations.map(curve('observation')));
+    this.actions.show(curves.actions.map(curve('action')));
+    if (!curves.drawn) return;
+    const { frames } = await send('/segment', { segment, frames: true });
+    if (!same(segment, this.segment) || !frames.length) return;
+    let at = 0;
+    this.picture.alt = `the robot, ${words(segment)}`;
+    this.picture.hidden = false;
+    const next = () => { this.picture.src = frames[at++ % frames.length]; };
+    next();
+    if (!matchMedia('(prefers-reduced-motion: reduce)').matches) {
+      this.timer = setInterval(next, FRAME_MS);
+    }
+  }
+}
+
+const one = new Shown(at('one'), 'The segment');
+const two = new Shown(at('two'), 'The second');
+
+/** The segments to judge now: one, or two to be compared. */
+function due() {
+  if (state.correcting) return [state.correcting];
+  const waiting = state.desk ? state.desk.waiting : [];
+  const now = waiting.filter((each) => !state.later.some((later) => same(each, later)));
+  const rest = [...now, ...waiting.filter((each) => !now.includes(each))];
+  return rest.slice(0, state.comparing ? 2 : 1);
+}
+
+function render() {
+  const { desk } = state;
+  if (!desk) return;
+  write(at('title'), `${desk.task}: score segments as ${desk.scorer}`);
+  const phase = desk.phase < 0 ? 'no phase is done yet' : `phase ${desk.phase + 1} of ${desk.phases} is done`;
+  write(at('state'), desk.finished ? 'The run has ended: nothing more is learnt.' : `The run goes on without you; ${phase}.`);
+  const kept = state.shown.length && state.shown.every((each) => [...desk.waiting, state.correcting].some((w) => same(w, each)));
+  const wanted = state.comparing && !state.correcting ? 2 : 1;
+  if (!kept || state.shown.length !== wanted) state.shown = due();
+  const comparing = state.shown.length === 2;
+  const none = !state.shown.length || desk.finished;
+  at('answers').hidden = none || comparing;
+  at('choices').hidden = none || !comparing;
+  at('two').hidden = !comparing;
+  at('one').hidden = none;
+  at('pair').disabled = desk.waiting.length < 2;
+  at('same').disabled = state.last === null;
+  const what = state.correcting ? 'Corrected: ' : '';
+  write(at('which'), none ? 'Nothing waits to be scored.' :
+    `${what}${state.shown.map(words).join(' | ')}. ${desk.waiting.length} wait. ${comparing ? '' : KEYS}`);
+  if (!none) one.show(state.shown[0]).catch(refuse);
+  if (comparing) two.show(state.shown[1]).catch(refuse);
+  renderGiven();
+}
+
+function stated(given) {
+  if (given.other) {
+    if (given.outcome === null) return 'cannot tell';
+    return { 1: 'the first is better', 0.5: 'as good', 0: 'the second is better' }[given.outcome];
+  }
+  return given.value === null ? 'cannot tell' : number(given.value);
+}
+
+function renderGiven() {
+  const rows = [...state.desk.given].reverse().map((given) => {
+    const correct = make('button', { text: 'Correct' });
+    correct.addEventListener('click', () => {
+      state.correcting = given.segment;
+      state.comparing = false;
+      state.shown = [];
+      render();
+    });
+    const cells = [
+      make('td', { text: words(given.segment) + (given.other ? ` | ${words(given.other)}` : '') }),
+      make('td', { text: stated(given) }),
+      make('td', { text: given.phase === null ? 'waits' : `phase ${given.phase}` }),
+      make('td', { children: given.other ? [] : [correct] }),
+    ];
+    return make('tr', { children: cells });
+  });
+  at('given').replaceChildren(...rows);
+}
+
+function refuse(error) {
+  write(at('refused'), error.message);
+}
+
+async function judge(statement) {
+  if (state.busy || at('answers').hidden && at('choices').hidden) return;
+  state.busy = true;
+  const begin = performance.now();
+  write(at('refused'), '');
+  try {
+    const given = await send('/judge', statement);
+    if (!given.other && given.value !== null) state.last = given.value;
+    const took = performance.now() - begin;
+    write(at('confirmed'), `Number ${given.sequence}: ${stated(given)} for ${words(given.segment)}. The next commit takes it.`);
+    at('confirmed').dataset.ms = String(took);
+    state.correcting = null;
+    state.shown = [];
+  } catch (error) {
+    refuse(error);
+  } finally {
+    state.busy = false;
+  }
+  render();
+}
+
+const score = (value) => judge({ segment: state.shown[0], value });
+const prefer = (outcome) => judge({ segment: state.shown[0], other: state.shown[1], outcome });
+
+function later() {
+  state.later.push(...state.shown);
+  state.correcting = null;
+  state.shown = [];
+  render();
+}
+
+function compare() {
+  state.comparing = !state.comparing && state.desk.waiting.length > 1;
+  state.correcting = null;
+  state.shown = [];
+  render();
+}
+
+function renderScale() {
+  const [lowest, highest] = state.scale;
+  const any = highest < lowest;
+  at('number').hidden = !any;
+  at('points').hidden = any;
+  const buttons = [];
+  for (let point = lowest; point <= highest; point += 1) {
+    const button = make('button', { text: String(point) });
+    button.addEventListener('click', () => score(point));
+    buttons.push(button);
+  }
+  at('points').replaceChildren(...buttons);
+}
+
+at('number').addEventListener('submit', (event) => {
+  event.preventDefault();
+  const value = at('value').valueAsNumber;
+  if (Number.isFinite(value)) {
+    score(value);
+    at('value').value = '';
+  }
+});
+for (const [id, act] of Object.entries({
+  same: () => score(state.last),
+  cannot: () => score(null),
+  skip: later,
+  pair: compare,
+  single: compare,
+  first: () => prefer(1),
+  equal: () => prefer(0.5),
+  second: () => prefer(0),
+  neither: () => prefer(null),
+})) at(id).addEventListener('click', act);
+
+document.addEventListener('keydown', (event) => {
+  if (event.ctrlKey || event.metaKey || event.altKey || event.target instanceof HTMLInputElement) return;
+  const comparing = state.shown.length === 2;
+  const keys = comparing
+    ? { a: 'first', e: 'equal', b: 'second', x: 'neither', c: 'single' }
+    : { '=': 'same', x: 'cannot', s: 'skip', c: 'pair' };
+  const id = keys[event.key];
+  if (id) {
+    at(id).click();
+    event.preventDefault();
+    return;
+  }
+  const [lowest, highest] = state.scale;
+  const point = Number(event.key);
+  if (!comparing && /^\d$/.test(event.key) && point >= lowest && point <= highest) {
+    score(point);
+    event.preventDefault();
+  }
+});
+
+follow(
+  {
+    scale: (scale) => { state.scale = scale; renderScale(); },
+    desk: (desk) => { state.desk = desk; render(); },
+  },
+  (link) => write(at('link'), link === 'live' ? '' : 'The server does not answer.'),
+);
