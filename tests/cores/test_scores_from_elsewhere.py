@@ -6,7 +6,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from codetr_ros.cores import in_process
+from codetr_ros.bags.errors import BagError
+from codetr_ros.cores import in_process, taking_up
 from codetr_ros.cores.labeller import Labeller
 from codetr_ros.cores.people import SimulatedPeople
 from codetr_ros.cores.recorder import Recorder
@@ -373,3 +374,8 @@ def test_people_of_another_run_are_not_listened_to():
     people = SimulatedPeople(run(settings), settings)
     with pytest.raises(RecordError, match="is of run 'other'"):
         people.receive(transitions(run_id='other'))
+
+
+def test_a_run_of_simulated_people_is_not_gone_on_with_in_process(tmp_path):
+    with pytest.raises(BagError, match='simulated people do not remember'):
+        taking_up.prepare(tiny(**PEOPLE), 'run', tmp_path)

@@ -68,12 +68,17 @@ def prepare(
 
     Raises:
         BagError: the bag is damaged before its last commit, of another run or of other settings,
-            or cannot be written.
+            or cannot be written; or simulated people score, who do not remember.
         CheckpointError: the checkpoints are of another run, of other settings or of an older
             version.
         RecordError: the bag's records contradict each other.
     """
     settings = settled(settings)
+    if settings.scorer == 'simulated':
+        raise BagError(
+            f'scorer = simulated: simulated people do not remember what they were asked for, so '
+            f'that run {run_id!r} cannot be gone on with; start it again'
+        )
     torch.set_num_threads(settings.thread_count)
     bag = folder / run_folder.BAG
     before = announced(bag)
