@@ -2,8 +2,6 @@
 order.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -14,17 +12,17 @@ from helpers.builders import (
     ACTION,
     OBSERVATION,
     commit,
-    follow,
     run,
     score,
     task_spec,
     tiny,
     transitions,
 )
+from helpers.commits import STEPS, chunk, committed
 
 
 def intake(**changes) -> Intake:
-    settings = tiny(**changes)
+    settings = tiny(**(STEPS | changes))
     return Intake(run(settings), settings, scores=True)
 
 
@@ -36,10 +34,6 @@ def known(**changes) -> Intake:
 
 def memory() -> Trajectories:
     return Trajectories(OBSERVATION, ACTION, 7, 1000, 1000)
-
-
-def last(number: int) -> np.ndarray:
-    return np.array([number], np.int64)
 
 
 NAN = np.array([[0, 0, 0]] * 3 + [[0, np.nan, 0]] + [[0, 0, 0]] * 2, np.float32)
@@ -86,35 +80,42 @@ def test_what_cannot_be_is_refused_by_name_value_and_source_and_changes_nothing(
     it, m = known(), memory()
     with pytest.raises(RecordError, match=said):
         it.receive(record)
-    it.receive(transitions())
-    it.receive(commit())
+    it.receive(chunk())
+    it.receive(committed(chunk()))
     assert it.take(0, m) and m.steps == 5
 
 
 def test_nothing_enters_the_memory_before_its_commit():
     it, m = known(), memory()
-    it.receive(transitions())
+    it.receive(chunk())
     assert not it.take(0, m) and m.steps == 0 and it.missing is None
 
 
 def test_what_belongs_to_a_later_phase_waits_outside():
     it, m = known(), memory()
-    it.receive(transitions())
-    it.receive(transitions(sequence=1, first_step=5, phase=1, observations=follow(transitions())))
-    it.receive(commit())
+    it.receive(chunk())
+    it.receive(chunk(1))
+    first = committed(chunk())
+    it.receive(first)
     assert it.take(0, m) and m.steps == 5
-    it.receive(commit(phase=1, transitions=last(1)))
+    it.receive(committed(chunk(1), before=[first]))
     assert it.take(1, m) and m.steps == 10
 
 
 def test_the_order_of_arrival_does_not_matter():
-    first = transitions()
-    second = transitions(sequence=1, first_step=5, observations=follow(first))
-    scored = score(first_step=0, length=7)
+    halves = [
+        transitions(steps=2, observations=transitions().observations[:3]),
+        transitions(
+            sequence=1, first_step=2, steps=3, observations=transitions().observations[2:],
+            phase_end=True, scores_due=1,
+        ),
+    ]  # fmt: skip
+    scored = score(first_step=0, length=5)
     memories = []
-    for arrival in ([first, second, scored], [scored, second, first], [second, first, scored]):
-        it, m = intake(), memory()
-        for record in (*arrival, commit(transitions=last(1), scores=last(0)), task_spec()):
+    for arrival in ([*halves, scored], [scored, *halves[::-1]], [*halves[::-1], scored]):
+        it = Intake(run(tiny(**STEPS, delay=5)), tiny(**STEPS, delay=5), scores=True)
+        m = Trajectories(OBSERVATION, ACTION, 5, 1000, 1000)
+        for record in (*arrival, committed(*halves, scored), task_spec()):
             it.receive(record)
         assert it.take(0, m)
         memories.append(m.segments.batch(m.segments.ids()))
@@ -124,40 +125,41 @@ def test_the_order_of_arrival_does_not_matter():
 
 def test_a_commit_whose_steps_have_not_all_arrived_is_missing_until_they_have():
     it, m = known(), memory()
-    it.receive(transitions())
-    it.receive(commit(transitions=last(1)))
+    it.receive(committed(chunk()))
     assert not it.take(0, m) and it.missing == 0 and m.steps == 0
-    it.receive(transitions(sequence=1, first_step=5, observations=follow(transitions())))
-    assert it.take(0, m) and it.missing is None and m.steps == 10
+    assert it.waiting_for() == 'the rest of phase 0'
+    it.receive(chunk())
+    assert it.take(0, m) and it.missing is None and m.steps == 5
 
 
 def test_what_arrives_twice_is_counted_and_taken_once():
     it, m = known(), memory()
-    it.receive(transitions())
-    it.receive(transitions())
-    it.receive(commit())
+    it.receive(chunk())
+    it.receive(chunk())
+    it.receive(committed(chunk()))
     assert it.take(0, m) and m.steps == 5
-    it.receive(transitions())
-    assert it.duplicated == {'transitions': 2}
+    it.receive(chunk())
+    it.receive(committed(chunk()))
+    assert it.duplicated == {'transitions': 2, 'commits': 1}
 
 
 def test_a_score_for_no_segment_is_left_out_counted_and_said(caplog):
     it, m = known(), memory()
-    it.receive(transitions())
-    it.receive(score(first_step=7))
-    it.receive(commit(scores=last(0)))
+    steps, wrong = chunk(scores_due=1), score(first_step=7)
+    for record in (steps, wrong, committed(steps, wrong)):
+        it.receive(record)
     assert it.take(0, m)
     assert it.refused == {'composite_rewards': 1} and len(m.segments.ids()) == 0
     assert 'there is no such segment' in caplog.text
 
 
 def test_records_of_several_sources_enter_in_the_order_of_their_names():
-    settings = tiny(simulators=2)
+    settings = tiny(simulators=2, steps=30, phase_steps=10, warmup_steps=10)
     it = Intake(run(settings), settings, scores=False)
-    for source in ('b', 'a'):
-        it.receive(task_spec(source=source))
-        it.receive(transitions(source=source))
+    both = [chunk(source='b'), chunk(source='a')]
+    for record in both:
+        it.receive(task_spec(source=record.source))
+        it.receive(record)
     m = memory()
-    zero = np.zeros(2, np.int64)
-    it.receive(replace(commit(), sources=('b', 'a'), transitions=zero))
+    it.receive(committed(*both))
     assert it.take(0, m) and list(m.labelled.columns()['labels']) == ['a', 'b']

@@ -45,8 +45,9 @@ def test_a_frozen_method_sends_each_label_once_and_an_empty_part_where_none_is_n
     core, settings = labeller(method='uniform')
     episode = Endless(settings)
     work = core.work()
-    for phase in range(2):
-        episode.phase(core, phase)
+    episode.phase(core, 0)
+    slices(work)
+    episode.phase(core, 1)
     (first,) = [r for r in slices(work) if isinstance(r, StepRewards)]
     episode.phase(core, 2)
     (second,) = [r for r in slices(work) if isinstance(r, StepRewards)]
@@ -87,9 +88,10 @@ def test_labels_of_a_model_that_learns_are_all_of_its_newest_version_unless_aske
     core, settings = labeller()
     episode = Endless(settings)
     work = core.work()
+    said = []
     for phase in range(3):
         episode.phase(core, phase)
-    said = slices(work)
+        said += slices(work)
     ages = [
         dict(zip(r.names, r.values, strict=True))['label_age_max']
         for r in said
@@ -102,9 +104,10 @@ def test_a_warm_up_without_scores_delays_the_fit_and_freezes_no_scale():
     core, settings = labeller()
     episode = Endless(settings)
     work = core.work()
+    said = []
     for phase in range(2):
         episode.phase(core, phase, scored=False)
-    said = slices(work)
+        said += slices(work)
     (part,) = [r for r in said if isinstance(r, StepRewards)]
     assert (part.parts, len(part.labels)) == (1, 0)
     (metrics,) = [r for r in said if isinstance(r, Metrics) and r.phase == 1]
@@ -115,7 +118,12 @@ def test_a_warm_up_without_scores_delays_the_fit_and_freezes_no_scale():
 
 def test_labels_travel_in_parts_well_below_the_shared_memory_segment():
     settings = tiny(
-        method='uniform', phase_steps=30_000, warmup_steps=30_000, delay=1, memory_steps=100_000
+        method='uniform',
+        steps=60_000,
+        phase_steps=30_000,
+        warmup_steps=30_000,
+        delay=1,
+        memory_steps=100_000,
     )
     core = Labeller(run(settings), settings, 'reward', None)
     core.receive(task_spec(horizon=100_000))
@@ -146,13 +154,15 @@ def test_the_learner_waits_for_all_parts_of_the_labels_before_it_learns():
     episode = Endless(settings)
     work = core.work()
     slices(work)
-    for phase in range(2):
-        episode.phase(core, phase)
+    episode.phase(core, 0)
     permitted = [r for r in slices(work) if isinstance(r, Policy)]
     assert [p.phase for p in permitted] == [1]
-    core.receive(step_rewards(phase=1, parts=2, part=1))
+    episode.phase(core, 1)
+    made_of = {'phase': 1, 'parts': 2, 'commit': episode.commits[1]}
+    core.receive(step_rewards(part=1, **made_of))
     assert slices(work) == [] and core.report().updates == 0
-    core.receive(step_rewards(phase=1, parts=2, part=0, first_steps=np.array([7], np.uint32)))
+    assert core.waiting_for() == 'labels of phase 1 from the reward node'
+    core.receive(step_rewards(part=0, first_steps=np.array([7], np.uint32), **made_of))
     said = slices(work)
     (permit,) = [r for r in said if isinstance(r, Policy)]
     assert (permit.phase, permit.version, permit.random) == (2, 1, False)
@@ -168,22 +178,23 @@ def test_labels_that_come_again_while_the_learner_learns_from_them_are_counted_a
     episode = Endless(settings)
     work = core.work()
     for phase in range(2):
+        slices(work)
         episode.phase(core, phase)
     slices(work)
-    labels = step_rewards(phase=1, parts=1)
+    labels = step_rewards(phase=1, parts=1, commit=episode.commits[1])
     core.receive(labels)
     assert next(work) == []  # the first burst of updates
     core.receive(labels)
     assert core.duplicated == {'step_rewards': 1}
-    assert core._labels == {}  # nothing is held for ever
+    assert core._labels._held == {}  # nothing is held for ever
 
 
 def test_nothing_is_learnt_while_nothing_is_labelled_and_that_is_counted():
     core, settings = learner()
     episode = Endless(settings)
     work = core.work()
-    slices(work)
     for phase in range(2):
+        slices(work)
         episode.phase(core, phase)
     slices(work)
     empty = np.empty(0, np.uint32)
@@ -195,6 +206,7 @@ def test_nothing_is_learnt_while_nothing_is_labelled_and_that_is_counted():
             first_steps=empty,
             lengths=empty,
             labels=np.empty(0, np.float32),
+            commit=episode.commits[1],
         )
     )
     slices(work)
@@ -278,7 +290,8 @@ def test_a_policy_that_has_diverged_ends_the_run_and_says_what_to_do():
     for phase in range(2):
         episode.phase(core, phase)
         slices(work)
-    core.receive(step_rewards(phase=1, labels=np.full(5, 3e38, np.float32)))
+    labels = np.full(5, 3e38, np.float32)
+    core.receive(step_rewards(phase=1, labels=labels, commit=episode.commits[1]))
     said = 'not finite after phase 1 .*Lower sac.actor_learning_rate'
     with pytest.raises(LearnerError, match=said):
         slices(work)

@@ -18,10 +18,12 @@ from codetr_ros.records import (
     CompositeReward,
     EpisodeResult,
     RecordError,
+    StepRewards,
     Transitions,
     TrueRewards,
 )
-from helpers.builders import policy, task_spec, tiny
+from codetr_ros.records.digests import digest
+from helpers.builders import policy, step_rewards, task_spec, tiny
 from helpers.builders import run as run_spec
 from helpers.own_environments import (
     HORIZON,
@@ -178,8 +180,9 @@ def check_everybody_takes(settings, published, after):
     assert memory.steps == 4 * 90
 
 
-def test_a_recorder_commits_from_its_first_phase_without_a_commit():
-    settings = tiny(task=NEVER_ENDS)
+@pytest.mark.parametrize('kept', ['first', 'all'])
+def test_a_recorder_commits_from_its_first_phase_without_a_commit(kept):
+    settings = tiny(task=NEVER_ENDS, record_relabels=kept)
     permits = policies(settings.task)
     published = simulate(settings, permits)
     settings = settings.changed({'steps': 360, 'phase_steps': 90, 'warmup_steps': 90})
@@ -187,7 +190,7 @@ def test_a_recorder_commits_from_its_first_phase_without_a_commit():
     def recorder():
         return Recorder(run_spec(settings), settings, 'record')
 
-    whole, said = recorder(), []
+    whole, said, published_labels = recorder(), [], []
     work = whole.work()
     for each in (*permits, *published):
         if isinstance(each, whole.subscribes):
@@ -195,6 +198,10 @@ def test_a_recorder_commits_from_its_first_phase_without_a_commit():
             said.append(each)
         while (made := next(work)) is not None:
             said += made
+            labels = [labels_of(made[0])]
+            whole.receive(labels[0])
+            said += [whole.kept(labels[0])]
+            published_labels += labels
     commits = kind(Commit, said)
     assert [c.phase for c in commits] == [0, 1, 2, 3]
     for ends in range(4):
@@ -205,8 +212,11 @@ def test_a_recorder_commits_from_its_first_phase_without_a_commit():
         assert again.phase == ends + 1
         work = again.work()
         given = []
+        again.receive(published_labels[ends])  # a reward node publishes them again as well
         for record in said[stops + 1 :]:
-            if isinstance(record, again.subscribes):
+            if isinstance(record, StepRewards):
+                again.receive(published_labels[record.phase])
+            elif isinstance(record, again.subscribes):
                 again.receive(record)
             while (made := next(work)) is not None:
                 given += made
@@ -220,6 +230,19 @@ def test_a_recorder_commits_from_its_first_phase_without_a_commit():
     said[said.index(commits[0])] = wrong
     with pytest.raises(RecordError, match='names transitions .-1., and the bag holds .0. before'):
         restored(recorder(), said)
+
+
+def labels_of(committed):
+    """Labels of a phase: its last segment, and once more the first one of all."""
+    phase = committed.phase
+    return step_rewards(
+        phase=phase,
+        episodes=np.array([0, phase], np.uint32),
+        first_steps=np.array([0, 7], np.uint32),
+        lengths=np.array([7, 7], np.uint32),
+        labels=np.arange(14, dtype=np.float32) + phase,
+        commit=digest(committed),
+    )
 
 
 def restored(recorder, held):

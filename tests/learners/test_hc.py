@@ -19,7 +19,8 @@ from codetr_ros.learners.hc import HC
 from codetr_ros.learners.histories import HISTORIES, HistoryBatch, ScoredSteps
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import CompositeReward, EpisodeResult, Policy, StepRewards
-from helpers.builders import commit, run, score, task_spec, tiny, transitions
+from helpers.builders import run, score, task_spec, tiny, transitions
+from helpers.commits import committed
 
 torch.set_num_threads(1)
 
@@ -330,9 +331,11 @@ def test_the_learner_itself_takes_the_scores_and_no_labels() -> None:
     core.receive(task_spec())
     work = core.work()
     next(work)
-    core.receive(transitions(steps=10))
-    core.receive(score(length=5, value=2.0))
-    core.receive(commit(scores=np.array([0])))
+    steps = transitions(steps=10, phase_end=True, scores_due=1)
+    scored = score(length=5, value=2.0)
+    (permitted,) = core._intake.policies.values()
+    for record in (steps, scored, committed(steps, scored, policy_digest=permitted)):
+        core.receive(record)
     said = [next(work) for _ in range(4)]
     permit = next(r for out in said for r in out or () if isinstance(r, Policy))
     assert (permit.phase, permit.version) == (1, 0) and '"segment_steps":5' in permit.network

@@ -13,7 +13,7 @@ from codetr_ros.records import (
     StepRewards,
     Transitions,
 )
-from codetr_ros.records.numbering import Judgement
+from codetr_ros.records.chain import named, publisher
 
 _MOST_HELD = 10_000  # the depth of another recorder's queue: a message that is later is lost
 _PERMITTING = (Transitions, CompositeReward, Preference, Commit)  # records that others wait for
@@ -78,25 +78,3 @@ def causal(messages: Iterable[MessageT], lag: int) -> Iterator[MessageT]:
             at = next(ready, None) if permits else None
             following = held.pop(at) if at is not None else None
     yield from held
-
-
-def publisher(record: Transitions | Judgement) -> tuple[type, str]:
-    """The publisher that numbers such a record: the record's type and the publisher's name.
-
-    Preferences have their numbers among those of their scorer's scores.
-    """
-    if isinstance(record, Transitions):
-        return Transitions, record.source
-    return CompositeReward, record.scorer
-
-
-def named(commit: Commit) -> dict[tuple[type, str], int]:
-    """The last sequence number of each publisher that a commit names."""
-    return {
-        (kind, name): number
-        for kind, names, last in (
-            (Transitions, commit.sources, commit.transitions),
-            (CompositeReward, commit.scorers, commit.scores),
-        )
-        for name, number in zip(names, last.tolist(), strict=True)
-    }

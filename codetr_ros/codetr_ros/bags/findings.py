@@ -11,7 +11,7 @@ NAMED = 1000
 class Finding(NamedTuple):
     """Something that is wrong with a bag."""
 
-    kind: str  # file, index, metadata, gap, duplicate, value, segment, commit, run, record
+    kind: str  # file, index, metadata, gap, duplicate, value, segment, commit, digest, run, record
     place: str
     text: str
 

@@ -14,9 +14,10 @@ from typing import NamedTuple
 
 from pydantic import Field
 
-from codetr_ros.bags.causal import causal, named, publisher
+from codetr_ros.bags.causal import causal
 from codetr_ros.bags.definitions import encode, is_own
 from codetr_ros.bags.older import as_now
+from codetr_ros.bags.played_commits import PlayedCommits
 from codetr_ros.bags.reader import Bag
 from codetr_ros.config import Settings, SettingsError, from_canonical
 from codetr_ros.records import (
@@ -33,6 +34,8 @@ from codetr_ros.records import (
     Transitions,
     TrueRewards,
 )
+from codetr_ros.records.chain import named, publisher
+from codetr_ros.records.digests import digest
 from codetr_ros.records.numbering import Judgement, Numbering
 from codetr_ros.runs.reports import CoreReport
 
@@ -48,7 +51,7 @@ class Item(NamedTuple):
     """A message to be published."""
 
     record: Record
-    data: bytes  # as it was recorded, or as this version writes what an older one recorded
+    data: bytes  # as this version writes it; empty: it is another record than in the bag
     log_time: int  # [ns] when it was received
 
 
@@ -183,9 +186,9 @@ class Playback:
         learners: roles to wait for. If there are any, messages that belong to no phase that is
             played are left out.
         pace: when a message is due at the earliest; None: at once.
+        commits: completes the commits; None: they go out as they were recorded.
     """
 
-    subscribes: tuple[type, ...] = (Metrics,)
     missing = None  # it takes no phases in
     due = None
 
@@ -196,7 +199,10 @@ class Playback:
         lag: int,
         learners: Collection[str],
         pace: Pace | None = None,
+        commits: PlayedCommits | None = None,
     ) -> None:
+        self._commits = commits
+        self.subscribes: tuple[type, ...] = (Metrics, *(commits.subscribes if commits else ()))
         self._messages = causal(messages, lag)
         self._phases = phases
         self._lag = lag
@@ -212,9 +218,14 @@ class Playback:
         self.finished = False
 
     def receive(self, record: Record) -> None:
-        """Note that a role has handled a phase."""
+        """Note that a role has handled a phase, or what it has made for the next."""
+        if self._commits is not None and isinstance(record, self._commits.subscribes):
+            self._commits.note(record, recorded=False)
         if isinstance(record, Metrics) and record.role in self._handled:
             self._handled[record.role] = max(self._handled[record.role], record.phase)
+
+    def fetched(self, phase: int) -> None:
+        """Do nothing: no phase is missing."""
 
     def work(self) -> Iterator[list[Item] | None]:
         """Slices of a few messages; None while waiting for a role or for the time.
@@ -235,7 +246,7 @@ class Playback:
             if isinstance(item.record, Commit):
                 self._check(item.record)
                 self.phase = item.record.phase
-            batch.append(item)
+            batch.append(self._played(item))
             if len(batch) == BATCH:
                 yield batch
                 batch = []
@@ -247,6 +258,31 @@ class Playback:
         while True:
             yield None
 
+    def _played(self, item: Item) -> Item:
+        """A message as it goes out.
+
+        Raises:
+            PlayError: a commit states otherwise what is played.
+        """
+        record, commits = item.record, self._commits
+        if commits is None:
+            return item
+        if isinstance(record, Commit):
+            record, differing = commits.completed(record)
+            if differing:
+                raise PlayError(
+                    f'phase {record.phase} is not what its commit states: {"; ".join(differing)} '
+                    'differ. `codetr bag verify` names all that differs; play another bag'
+                )
+        else:
+            commits.note(record, recorded=True)
+            if isinstance(record, StepRewards):
+                record = commits.labelled(record)
+        same = record is item.record or (
+            isinstance(record, Commit) and digest(record) == digest(item.record)
+        )
+        return item if same else Item(record, b'', item.log_time)
+
     def _held_back(self, item: Item) -> str | None:
         """Why a message may not go out yet."""
         record = item.record
@@ -254,6 +290,9 @@ class Playback:
             if self._pace is not None:
                 self._pace.restart()
             return late
+        lacking = isinstance(record, Commit) and self._commits and self._commits.lacks(record)
+        if lacking:
+            return lacking
         if self._pace is not None and not self._pace.due(item.log_time):
             return 'the time at which the next message was recorded'
         return None

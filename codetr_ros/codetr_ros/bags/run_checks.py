@@ -30,6 +30,7 @@ from codetr_ros.records import (
     TrueRewards,
     describe,
 )
+from codetr_ros.records.chain import Chain, states_digests
 from codetr_ros.records.checks import check_preference
 from codetr_ros.records.numbering import Judgement
 from codetr_ros.system.parsing import parse_json
@@ -63,6 +64,9 @@ class RunChecks:
         self._elsewhere = False  # others than the simulator score, when and what they like
         self._permitted = 0
         self._parts: tuple[int, int, int] | None = None  # phase, next part, parts
+        self._chain = Chain(1)
+        self._made_of: dict[int, str] = {}  # phase -> digest of its commit
+        self._stated = 0  # commits with digests
         self._take: dict[type, Callable[[Any, Any], None]] = {
             RunSpec: self._spec,
             TaskSpec: self._task,
@@ -81,6 +85,7 @@ class RunChecks:
         check = self._take.get(entry.kind)
         if check is not None:
             check(entry.record, entry.place)
+        self._chain.note(entry.record)
         while self._waiting and (self._ordered or self._arrived(self._waiting[0][0])):
             self._commit(*self._waiting.pop(0))
 
@@ -127,6 +132,8 @@ class RunChecks:
             self._cuts = Cuts(settings['delay'], record.seed)
             self._elsewhere = settings.get('scorer', 'simulator') != 'simulator'
             self._missing = self._elsewhere or settings.get('score_missing', 0) > 0
+            free = settings.get('pace') == 'free'
+            self._chain.lag = None if free else 1 + bool(settings.get('overlap'))
         except (ValueError, LookupError, TypeError) as error:
             self._add('run', place, f'settings cannot be read: {error}')
         for source in self.sources.values():
@@ -213,6 +220,15 @@ class RunChecks:
             there = self._scorers.get(name)
             whole &= self._named('composite rewards', name, last, there, record.phase, place)
         self.whole += whole
+        self._digests(record, place)
+
+    def _digests(self, record: Commit, place: Any) -> None:
+        """Compare what a commit states with what the bag has, and go on behind it."""
+        self._stated += states_digests(record)
+        for text in self._chain.differences(record):
+            self._add('digest', place, f'commit of phase {record.phase} has another of {text}')
+        self._chain.follow(record)
+        self._made_of[record.phase] = self._chain.last
 
     def _named(
         self, what: str, name: str, last: int, there: Numbers | None, phase: int, place: Any
@@ -242,6 +258,9 @@ class RunChecks:
                 f'{expected[0]} is next'
             )  # fmt: skip
         self._parts = record.phase, record.part + 1, record.parts
+        made_of = self._made_of.get(record.phase, '')
+        if record.commit and made_of and record.commit != made_of:
+            self._add('digest', place, f'{describe(record)} was made of another commit')
         if not np.isfinite(record.labels).all():
             self._add('value', place, f'{describe(record)}: labels not finite')
         if not record.source:
@@ -306,6 +325,11 @@ class RunChecks:
                     )
                 else:
                     self._add('run', place, f'{source.name!r} has not announced its task')
+        if self.phases > self._stated:
+            self._findings.remarks.append(
+                f'{self.name}: {self.phases - self._stated} commits state no digests (protocol '
+                '1): a value that was changed with its checksum goes unnoticed there'
+            )
         if self._run is None and self.phases:
             self._add(
                 'run', place, 'has commits, but no settings: the record of the run is missing'

@@ -60,7 +60,7 @@ class Consumer(Part, ABC):
         self._folder = folder
         self._scores = scores
         self._true_rewards = true_rewards
-        self._intake = Intake(run, settings, scores, true_rewards)
+        self._intake = Intake(run, settings, scores, true_rewards, self._newest_permitted)
         self._memory: Trajectories | None = None
         self._phase = 0  # the next to be learnt from
         self._saved = -1
@@ -74,6 +74,26 @@ class Consumer(Part, ABC):
     def missing(self) -> int | None:
         """A committed phase that is incomplete; None if there is none."""
         return self._intake.missing
+
+    @property
+    def doubt(self) -> str:
+        """What of the missing phase differs from its commit, in words; empty if nothing does."""
+        return self._intake.doubt
+
+    def fetched(self, phase: int) -> None:
+        """Note that everything of a phase has been sent again by the recorder."""
+        self._intake.fetched(phase)
+
+    def waiting_for(self) -> str:
+        """What the next slice waits for, for people."""
+        return self._intake.waiting_for()
+
+    def _newest_permitted(self) -> int:
+        """The newest phase that can have been permitted: the learner has learnt from one, and
+        permits those that it is then ahead of.
+        """
+        learnt = self._phase - 1 if self._from is None else self._from.phase
+        return learnt + self._settings.ahead
 
     @property
     def phase(self) -> int:

@@ -40,6 +40,9 @@ class Core(Protocol[Given_co]):
     def refused(self) -> 'Counter[str]':
         """Counts of records that `receive` took and that were refused later, by topic."""
 
+    def fetched(self, phase: int) -> None:
+        """Note that everything of a phase has been sent again by the recorder."""
+
     def receive(self, record: Record) -> None:
         """Store a record.
 
@@ -80,6 +83,9 @@ class Part:
     def due(self) -> int | None:
         """The next phase to be finished here; None if there are none here."""
         return None
+
+    def fetched(self, phase: int) -> None:
+        """Do nothing: no phase is missing."""
 
     def waiting_for(self) -> str:
         """What the next slice waits for, for people."""

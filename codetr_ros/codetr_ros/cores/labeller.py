@@ -27,6 +27,7 @@ from codetr_ros.records import (
     StepRewards,
     TrueRewards,
 )
+from codetr_ros.records.digests import digest_of_all
 from codetr_ros.records.roles import subscribed
 from codetr_ros.rewards import registry, saved
 from codetr_ros.rewards.asking import worth_asking
@@ -47,6 +48,8 @@ class Labeller(Consumer):
         folder: where checkpoints go; None: no checkpoints.
         checkpoint: a saved reward model to start from (`saved.read`); empty: a new one.
         frozen: only label with the checkpoint; else the model goes on learning.
+        alone: it learns again from what was recorded. The labels that commits name are those of
+            the run then, and on another machine not its own to the bit.
 
     Raises:
         CheckpointError: the checkpoint does not exist, or is damaged.
@@ -64,6 +67,7 @@ class Labeller(Consumer):
         folder: Path | None,
         checkpoint: str = '',
         frozen: bool = False,
+        alone: bool = False,
     ) -> None:
         if frozen and not checkpoint:
             raise RewardModelError(
@@ -72,6 +76,7 @@ class Labeller(Consumer):
             )
         self._start = saved.read(Path(checkpoint)) if checkpoint else None
         self._frozen = frozen
+        self._alone = alone
         oracle = registry.kind(settings).needs_true_rewards
         if oracle:
             self.subscribes = (*self.subscribes, TrueRewards)
@@ -102,8 +107,13 @@ class Labeller(Consumer):
         self._fitted = bool(facts['fitted'])
         assert self._memory is not None
         self._given = published.again(
-            facts['given'], checkpoint, self._memory.labelled, self._run.run_id
+            facts['given'],
+            checkpoint,
+            self._memory.labelled,
+            self._run.run_id,
+            self._intake.commits.digest(checkpoint.phase),
         )
+        self._note_labels(checkpoint.phase)
         return [*self._given, self._metrics(checkpoint.phase, self._last_metrics)]
 
     def _learn(
@@ -138,7 +148,9 @@ class Labeller(Consumer):
         }
         metrics |= self._of_scorers(memory, method)
         self._phase = phase + 1
-        self._given = published.numbered(self._run.run_id, phase, method.version, parts)
+        commit = self._intake.commits.digest(phase)
+        self._given = published.numbered(self._run.run_id, phase, method.version, parts, commit)
+        self._note_labels(phase)
         yield [
             *self._given,
             *self._asked(phase, memory, method),
@@ -179,6 +191,16 @@ class Labeller(Consumer):
         for name, fact in facts.items():
             known |= {f'scorer_{name}_{what}': float(n) for what, n in asdict(fact).items()}
         return known
+
+    def _newest_permitted(self) -> int:
+        """As of all consumers. But through the warm-up the learner waits for no labels."""
+        warm = self._settings.warmup_phases - 2 + self._settings.ahead
+        return max(super()._newest_permitted(), warm)
+
+    def _note_labels(self, phase: int) -> None:
+        """Expect the labels just published in the commit that names them."""
+        if not self._alone:
+            self._intake.labels[phase] = digest_of_all(self._given)
 
     def _fit(
         self, phase: int, memory: Trajectories, method: RewardMethod

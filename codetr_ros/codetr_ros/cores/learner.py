@@ -1,5 +1,6 @@
 """The learner's side of Algorithm 1: permit a phase, take it in, learn, permit the next."""
 
+import logging
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import torch
 from codetr_ros.config import Settings
 from codetr_ros.cores import going_on
 from codetr_ros.cores.consumer import Consumer
+from codetr_ros.cores.held_labels import HeldLabels
 from codetr_ros.learners import registry
 from codetr_ros.learners.base import PolicyLearner
 from codetr_ros.memory.trajectories import Trajectories
@@ -25,11 +27,14 @@ from codetr_ros.records import (
     describe,
 )
 from codetr_ros.records.checks import check_labels, check_run
+from codetr_ros.records.digests import digest, digest_of_all
 from codetr_ros.records.roles import subscribed
 from codetr_ros.runs import checkpoints
 from codetr_ros.runs.checkpoints import Checkpoint
 from codetr_ros.runs.reports import CoreReport
 from codetr_ros.system.devices import usable
+
+_log = logging.getLogger(__name__)
 
 
 class Learner(Consumer):
@@ -52,7 +57,8 @@ class Learner(Consumer):
         usable(settings.device)  # refuse a missing device at once
         self.subscribes = subscribed('learner', settings.labels_steps)
         super().__init__(run, settings, name, folder, scores=not settings.labels_steps)
-        self._labels: dict[int, dict[int, StepRewards]] = {}
+        self._labels = HeldLabels()
+        self._awaits_labels = False
         self._applied = 0  # labels of phases before this one have been taken in
         self._learner: PolicyLearner | None = None
 
@@ -72,17 +78,20 @@ class Learner(Consumer):
                 f'{int(record.lengths.sum())} steps'
             )
         check_labels(record, self._settings)
-        parts = self._labels.get(record.phase, {})
-        others = next((part.parts for part in parts.values()), record.parts)
-        if record.part >= record.parts or record.parts != others:
+        if record.phase > self._newest_permitted():
             raise RecordError(
-                f'{describe(record)}: part {record.part} of {record.parts}, where others of the '
-                f'phase are of {others}: two reward nodes? Stop one of them'
+                f'{describe(record)} has labels of phase {record.phase}, and phase '
+                f'{self._newest_permitted()} is the newest that is permitted: stop what '
+                'publishes them'
             )
-        if record.phase < self._applied or record.part in parts:
+        made_of = self._intake.commits.digest(record.phase)
+        if made_of and record.commit != made_of:
+            raise RecordError(
+                f'{describe(record)} was made of the commit {record.commit!r}; that of phase '
+                f'{record.phase} is {made_of!r}: stop the second reward node'
+            )
+        if record.phase < self._applied or not self._labels.add(record):
             self.duplicated[TOPICS[StepRewards]] += 1
-        else:
-            self._labels.setdefault(record.phase, {})[record.part] = record
 
     def _begin(self) -> Iterator[list[Record]]:
         spec = self._intake.tasks.first
@@ -99,8 +108,7 @@ class Learner(Consumer):
         learner.counters.clear()
         learner.counters.update(going_on.counted(checkpoint.meta, 'learner_counters'))
         self._applied = phase + 1
-        for early in [early for early in self._labels if early <= phase]:
-            del self._labels[early]
+        self._labels.forget(phase)
         return self._published(phase, self._last_metrics)
 
     def _learn(
@@ -111,11 +119,7 @@ class Learner(Consumer):
         metrics: dict[str, float] = {}
         if learns:
             if self._settings.labels_steps:
-                while not self._labelled(phase):
-                    yield None
-                self._applied = phase + 1
-                for _, part in sorted(self._labels.pop(phase).items()):
-                    self._counters['labels of evicted steps'] += memory.apply(part)
+                yield from self._take_labels(phase, memory)
             for values in learner.train(phase, memory):
                 metrics |= values
                 yield []
@@ -133,9 +137,30 @@ class Learner(Consumer):
         """What is published once a phase has been learnt from."""
         return [self._permit(phase + self._settings.lag, phase), self._metrics(phase, metrics)]
 
-    def _labelled(self, phase: int) -> bool:
-        parts = self._labels.get(phase, {})
-        return bool(parts) and len(parts) == next(iter(parts.values())).parts
+    def _take_labels(self, phase: int, memory: Trajectories) -> Iterator[None]:
+        """Wait for the labels that were made of a phase's commit, and take them in."""
+        commit = self._intake.commits.digest(phase)
+        self._awaits_labels = True
+        while not self._labels.whole(phase, commit):
+            yield None
+        self._awaits_labels = False
+        self._applied = phase + 1
+        parts, others = self._labels.take(phase, commit)
+        if others:
+            self.refused[TOPICS[StepRewards]] += others
+            _log.error(
+                'refused %s parts of labels of phase %s that were made of no commit of the '
+                'recorder: stop what publishes them', others, phase,
+            )  # fmt: skip
+        for part in parts:
+            self._counters['labels of evicted steps'] += memory.apply(part)
+        self._intake.labels[phase] = digest_of_all(parts)
+
+    def waiting_for(self) -> str:
+        """What the next slice waits for, for people."""
+        if self._awaits_labels:
+            return f'labels of phase {self._phase} from the reward node'
+        return super().waiting_for()
 
     def _permit(self, phase: int, version: int) -> Policy:
         learner, settings = self._learner, self._settings
@@ -147,7 +172,7 @@ class Learner(Consumer):
             for source, n in zip(sources, shares, strict=True)
         ]
         random = phase < settings.warmup_phases
-        return Policy(
+        policy = Policy(
             run_id=self._run.run_id,
             phase=phase,
             version=version,
@@ -157,6 +182,9 @@ class Learner(Consumer):
             network='' if random else learner.network,
             weights=b'' if random else weights_bytes(learner.actor),
         )
+        if not settings.free:
+            self._intake.policies[phase] = digest(policy)
+        return policy
 
     def _state(self) -> dict[str, torch.Tensor]:
         assert self._learner is not None

@@ -17,10 +17,17 @@ _SPANS = ('episodes', 'first_steps', 'lengths')
 
 
 def numbered(
-    run_id: str, phase: int, version: int, pieces: Sequence[StepRewards]
+    run_id: str, phase: int, version: int, pieces: Sequence[StepRewards], commit: str
 ) -> list[StepRewards]:
     """Join small pieces, source by source, into parts as large as allowed, and number them. If
     there are none, one empty part.
+
+    Args:
+        run_id: of the run.
+        phase: of which they are.
+        version: of the model that made them.
+        pieces: the labels.
+        commit: digest of the commit that they were made of.
     """
     parts: list[list[StepRewards]] = []
     size = MESSAGE_BYTES
@@ -32,7 +39,7 @@ def numbered(
         parts[-1].append(piece)
         size += weight
     if not parts:
-        return [_empty(run_id, phase, version)]
+        return [_empty(run_id, phase, version, commit)]
     return [
         StepRewards(
             run_id=run_id,
@@ -45,12 +52,13 @@ def numbered(
             first_steps=np.concatenate([piece.first_steps for piece in part]),
             lengths=np.concatenate([piece.lengths for piece in part]),
             labels=np.concatenate([piece.labels for piece in part]),
+            commit=commit,
         )
         for i, part in enumerate(parts)
     ]
 
 
-def _empty(run_id: str, phase: int, version: int) -> StepRewards:
+def _empty(run_id: str, phase: int, version: int, commit: str) -> StepRewards:
     nothing = np.empty(0, np.uint32)
     return StepRewards(
         run_id=run_id,
@@ -63,6 +71,7 @@ def _empty(run_id: str, phase: int, version: int) -> StepRewards:
         first_steps=nothing,
         lengths=nothing,
         labels=np.empty(0, np.float32),
+        commit=commit,
     )
 
 
@@ -85,7 +94,11 @@ def spans(parts: Sequence[StepRewards]) -> dict[str, Tensor]:
 
 
 def again(
-    facts: Mapping[str, Any], checkpoint: Checkpoint, labelled: LabelledSteps, run_id: str
+    facts: Mapping[str, Any],
+    checkpoint: Checkpoint,
+    labelled: LabelledSteps,
+    run_id: str,
+    commit: str,
 ) -> list[StepRewards]:
     """The parts that were published before a checkpoint was saved.
 
@@ -94,6 +107,7 @@ def again(
         checkpoint: holds what `spans` made of them.
         labelled: the labels of the memory, as they were then.
         run_id: of the run.
+        commit: digest of the commit that they were made of.
     """
     parts = []
     for i, source in enumerate(facts['sources']):
@@ -110,6 +124,7 @@ def again(
                 parts=len(facts['sources']),
                 source=source,
                 labels=labelled.of(source, *rows.values()),
+                commit=commit,
                 **rows,
             )
         )

@@ -1,5 +1,9 @@
 """The recorder decides when a phase is whole, and commits it.
 
+Each commit has the digests of all that it names, of the policy that permitted the phase, of the
+labels that this policy was learnt with, and of the commit before. Labels of phase k are published
+before phase k + lag is permitted, so that to wait for them here keeps nobody waiting.
+
 The core knows nothing of bags. Its wiring writes every received record to disk before it publishes
 a `Commit`. So no record that a node learns from is ever lost.
 """
@@ -16,6 +20,7 @@ from codetr_ros.config import Settings
 from codetr_ros.cores.announced import Tasks
 from codetr_ros.cores.core import Part
 from codetr_ros.cores.left_out import LeftOut, voided
+from codetr_ros.cores.recorded_labels import RecordedLabels
 from codetr_ros.records import (
     TOPICS,
     Commit,
@@ -25,20 +30,33 @@ from codetr_ros.records import (
     Record,
     RecordError,
     RunSpec,
+    StepRewards,
     TaskSpec,
     Transitions,
     describe,
     metrics,
 )
-from codetr_ros.records.checks import check_preference, check_run, check_score, check_scorer
+from codetr_ros.records.chain import Chain, publisher
+from codetr_ros.records.checks import (
+    check_labels,
+    check_preference,
+    check_run,
+    check_score,
+    check_scorer,
+)
+from codetr_ros.records.digests import digest
 from codetr_ros.records.numbering import Judgement, Numbering
 from codetr_ros.runs.reports import CoreReport
 
 _log = logging.getLogger(__name__)
 
+STATED = ('transition_digests', 'score_digests', 'policy_digest', 'previous')
+"""Digests that a commit in a bag states, and that its records must have."""
+
 
 class Recorder(Part):
-    """Commits a phase once every permitted step and every due composite reward has arrived.
+    """Commits a phase once every permitted step, every due composite reward and the labels that
+    its policy was learnt with have arrived.
 
     Only a simulator's scores are due. Where another scores (setting `scorer`), a commit names the
     judgements that are there, and late ones join a later commit.
@@ -49,7 +67,9 @@ class Recorder(Part):
         name: node name.
     """
 
-    subscribes: tuple[type, ...] = (TaskSpec, Policy, Transitions, CompositeReward, Preference)
+    subscribes: tuple[type, ...] = (
+        *(TaskSpec, Policy, Transitions, CompositeReward, Preference, StepRewards),
+    )
 
     def __init__(self, run: RunSpec, settings: Settings, name: str) -> None:
         super().__init__()
@@ -58,6 +78,8 @@ class Recorder(Part):
         self._name = name
         self._tasks = Tasks(run, settings)
         self._permitted: dict[int, dict[str, int]] = {}
+        self._chain = Chain(None if settings.free else settings.lag)
+        self._labels = RecordedLabels(settings, self._chain)
         self._steps: Counter[tuple[int, str]] = Counter()  # (phase, source)
         self._ended: dict[tuple[int, str], tuple[int, int]] = {}  # -> last sequence, scores due
         self._transitions: Counter[str] = Counter()  # next sequence number of each source
@@ -83,10 +105,10 @@ class Recorder(Part):
             if self._settings.free:
                 return  # nothing waits for a permission
             self._check_permission(record)
-            steps = dict(zip(record.sources, record.steps.tolist(), strict=True))
-            self._permit(record, {source: n for source, n in steps.items() if n})
+            self._permit(record)
         elif isinstance(record, Transitions):
             if self._tasks.admit(record) and self._next(record, self._transitions, record.source):
+                self._chain.note(record)
                 self._steps[record.phase, record.source] += record.steps
                 if record.phase_end:
                     self._ended[record.phase, record.source] = (record.sequence, record.scores_due)
@@ -95,8 +117,8 @@ class Recorder(Part):
             check_scorer(record, self._settings)
             if self._settings.scored_elsewhere:
                 self._judged(record)
-            else:
-                self._next(record, self._scores, record.scorer)
+            elif self._next(record, self._scores, record.scorer):
+                self._chain.note(record)
         elif isinstance(record, Preference):
             check_preference(record, self._settings.scored_at_most)
             check_scorer(record, self._settings)
@@ -106,6 +128,10 @@ class Recorder(Part):
                     'so nobody compares; start the run with scorer=topic'
                 )
             self._judged(record)
+        elif isinstance(record, StepRewards):
+            check_labels(record, self._settings)
+            if not self._labels.take(record, self.phase):
+                self.duplicated[TOPICS[StepRewards]] += 1
 
     def _judged(self, record: Judgement) -> None:
         """Note a judgement; its scorer's earlier ones may still be on their way."""
@@ -118,8 +144,9 @@ class Recorder(Part):
                 'commits. Number them from 0 on, without gaps'
             )
         if not numbers.take(record.sequence):
-            self.duplicated[TOPICS[type(record)]] += 1
+            self._repeated(record)
             return
+        self._chain.note(record)
         if len(numbers.early) == 1 and record.sequence in numbers.early:
             _log.warning(
                 '%s of %r waits for number %s, which has not arrived: nothing is learnt from it '
@@ -171,6 +198,26 @@ class Recorder(Part):
         self._left_out.leave_out(new, self.phase)
         return new
 
+    def _permit(self, policy: Policy) -> None:
+        known = self._chain.policy(policy.phase)
+        if known == digest(policy):
+            self.duplicated[TOPICS[Policy]] += 1
+            return
+        if known:
+            raise RecordError(
+                f'{describe(policy)} is another policy than the one that has permitted phase '
+                f'{policy.phase} already: stop the second learner'
+            )
+        self._chain.note(policy)
+        steps = dict(zip(policy.sources, policy.steps.tolist(), strict=True))
+        self._permitted[policy.phase] = {source: n for source, n in steps.items() if n}
+
+    def kept(self, part: StepRewards) -> StepRewards:
+        """What the bag keeps of labels that `receive` has just taken: all, or the first of each
+        segment only (`record_relabels`).
+        """
+        return self._labels.kept(part)
+
     def restore(self, record: Record) -> None:
         """Take one of the records that the bag holds already, in the bag's order, commits among
         them. Call it before `work`, which then goes on with the first phase that has no commit.
@@ -178,37 +225,28 @@ class Recorder(Part):
         Raises:
             RecordError: it was refused before too, or a commit names what the bag does not hold.
         """
+        if isinstance(record, StepRewards) and self._labels.reduced:
+            self._labels.restore(record)
+            return
         if not isinstance(record, Commit):
             if isinstance(record, self.subscribes):
                 self.receive(record)
             return
         self._left_out.leave_out(record.dropped, record.phase)
-        if record.phase != self.phase or not self._whole(record.phase):
+        if record.phase != self.phase or not self._rolled_out(record.phase):
             raise RecordError(
                 f'{describe(record)} is in the bag, where phase {self.phase} is the next to be '
                 f'committed and {self.waiting_for()} is lacking: the bag is damaged. '
                 '`codetr bag verify` lists what is missing'
             )
-        made = self._commit(record.phase)
-        for field in ('sources', 'transitions', 'scorers', 'scores'):
+        made = self._commit(record.phase, record)
+        for field in ('sources', 'transitions', 'scorers', 'scores', *STATED):
             is_, was = (np.array(getattr(one, field)).tolist() for one in (made, record))
-            if is_ != was:
+            if is_ != was and (was or field not in STATED):
                 raise RecordError(
                     f'{describe(record)} names {field} {was}, and the bag holds {is_} before it: '
                     'the bag is damaged. `codetr bag verify` lists what is wrong'
                 )
-        self.phase = record.phase + 1
-
-    def _permit(self, policy: Policy, members: dict[str, int]) -> None:
-        known = self._permitted.setdefault(policy.phase, members)
-        if known is members:
-            return
-        if known != members:
-            raise RecordError(
-                f'{describe(policy)} permits {members}, where {known} is permitted already: stop '
-                'the second learner'
-            )
-        self.duplicated[TOPICS[Policy]] += 1
 
     def _next(self, record: Any, due: 'Counter[str]', name: str) -> bool:
         if record.sequence > due[name]:
@@ -217,10 +255,24 @@ class Recorder(Part):
                 f'What lies between never arrived: restart {name!r}'
             )
         if record.sequence < due[name]:
-            self.duplicated[TOPICS[type(record)]] += 1
+            self._repeated(record)
             return False
         due[name] += 1
         return True
+
+    def _repeated(self, record: Transitions | Judgement) -> None:
+        """Count a record that arrives again.
+
+        Raises:
+            RecordError: it is not the one that has come before.
+        """
+        if self._chain.contradicts(record):
+            _, name = publisher(record)
+            raise RecordError(
+                f'{describe(record)} is not the record of that number that has come from {name!r} '
+                'already: stop the second one of that name'
+            )
+        self.duplicated[TOPICS[type(record)]] += 1
 
     def work(self) -> Iterator[list[Record] | None]:
         """Yield a commit for each phase, in order, as soon as it is whole."""
@@ -249,6 +301,15 @@ class Recorder(Part):
         return dict(zip(self._tasks.sources, self._settings.shares_of(phase), strict=True))
 
     def _whole(self, phase: int) -> bool:
+        return self._rolled_out(phase) and not self._lacks_labels(phase)
+
+    def _lacks_labels(self, phase: int) -> bool:
+        """Whether labels are still to come that the policy of a phase was learnt with."""
+        before = self._settings.labels_named(phase)
+        return before is not None and not self._chain.labels(before)[0]
+
+    def _rolled_out(self, phase: int) -> bool:
+        """Whether all steps and scores of a phase are there."""
         members = self._members(phase)
         if not members:
             return False
@@ -264,7 +325,13 @@ class Recorder(Part):
             return False
         return self._scores[source] >= self._committed_scores[source] + end[1]
 
-    def _commit(self, phase: int) -> Commit:
+    def _commit(self, phase: int, recorded: Commit | None = None) -> Commit:
+        """Commit a phase.
+
+        Args:
+            phase: the next one.
+            recorded: its commit in a bag, which the next one then follows on.
+        """
         steps = self._members(phase)
         members = sorted(steps)
         self._permitted.pop(phase, None)
@@ -287,15 +354,21 @@ class Recorder(Part):
         self.phase = phase + 1  # at once: labels of the phase may be here before the next slice
         names = tuple(sorted(s for s in scorers if self._committed_scores[s]))
         scores = np.array([self._committed_scores[s] - 1 for s in names], np.int64)
-        return Commit(
-            run_id=self._run.run_id,
-            phase=phase,
-            sources=tuple(members),
-            transitions=np.array(last, np.int64),
-            scorers=names,
-            scores=scores,
-            dropped=tuple(dropped),
+        commit = self._chain.completed(
+            Commit(
+                run_id=self._run.run_id,
+                phase=phase,
+                sources=tuple(members),
+                transitions=np.array(last, np.int64),
+                scorers=names,
+                scores=scores,
+                dropped=tuple(dropped),
+            )
         )
+        self._chain.follow(recorded or commit)
+        self._labels.follow(phase)
+
+        return commit
 
     @property
     def due(self) -> int | None:
@@ -330,6 +403,8 @@ class Recorder(Part):
                 )
                 if due > 0:
                     lacks.append(f'{due} composite rewards of {source!r}')
+        if self._lacks_labels(self.phase):
+            lacks.append(f'labels of phase {self.phase - self._settings.lag} from the reward node')
         return f'the rest of phase {self.phase}' + (f': {", ".join(lacks)}' if lacks else '')
 
     def close(self) -> None:

@@ -1,7 +1,7 @@
 """The last phases of a run, as the recorder keeps them for a node that lacks some of them."""
 
-from codetr_ros.bags.causal import named, publisher
 from codetr_ros.records import Commit, CompositeReward, Preference, Record, Transitions
+from codetr_ros.records.chain import named, publisher
 
 
 class LastPhases:

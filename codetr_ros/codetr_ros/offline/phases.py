@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from codetr_ros.bags.causal import causal
-from codetr_ros.bags.older import as_now
+from codetr_ros.bags.older import AsNow, as_now
 from codetr_ros.bags.reader import Bag
 from codetr_ros.config import Settings
 from codetr_ros.cores.labeller import Labeller
@@ -106,13 +106,14 @@ def fold(
             diverged.
     """
     torch.set_num_threads(settings.thread_count)
-    core = Labeller(as_now(run), settings, NODE, folder, checkpoint, frozen)
+    core = Labeller(as_now(run), settings, NODE, folder, checkpoint, frozen, alone=True)
+    older = AsNow(None)  # the core compares no labels
     folded = Fold(core, run, settings, 0, [], core.refused, Recorded())
     kinds = (*core.subscribes, StepRewards)
     work = core.work()
     ours = (entry for entry in bag.entries(kinds) if entry.record.run_id == run.run_id)
     for entry in causal(ours, settings.ahead):
-        record = as_now(entry.record)
+        record = older(entry.record)
         if isinstance(record, StepRewards):
             folded.recorded.recorded(record)
             continue
@@ -123,6 +124,12 @@ def fold(
             report(f'{entry.place}: {error}')
         if isinstance(record, Commit):
             _work(work, folded)
+            if core.doubt:
+                raise FitError(
+                    f'{bag.path}: phase {core.missing} of run {run.run_id!r} is not what its '
+                    f'commit states: {core.doubt}. {folded.phases} phases were folded. '
+                    '`codetr bag verify` names what differs'
+                )
             if core.missing is not None:
                 raise FitError(
                     f'{bag.path}: phase {core.missing} of run {run.run_id!r} is committed, but '

@@ -74,10 +74,10 @@ class Fetcher:
             run_id=self._run_id, phase=missing, requester=self._link.full_name
         )
         future = self._client.call_async(request)
-        future.add_done_callback(lambda done: self._link.store(self._arrived, missing, done))
+        future.add_done_callback(lambda reply: self._link.store(self._arrived, missing, reply))
 
-    def _arrived(self, phase: int, done: Any) -> None:
-        response = done.result()
+    def _arrived(self, phase: int, reply: Any) -> None:
+        response = reply.result()
         log = self._link.node.get_logger()
         if not response.found:
             reason = shown(response.reason)
@@ -90,4 +90,6 @@ class Fetcher:
                 self._traffic.take_again(kind, data)
         except RecordError as error:
             self._traffic.refuse(SERVICE, error)
+        else:
+            self._traffic.core.fetched(phase)
         log.info(f'phase {phase}: {came} messages came again')

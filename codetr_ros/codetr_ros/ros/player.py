@@ -19,6 +19,7 @@ import rclpy
 from rclpy.signals import SignalHandlerOptions
 
 from codetr_ros.bags.playback import Item, Pace, Playback, RecordedRun
+from codetr_ros.bags.played_commits import PlayedCommits
 from codetr_ros.config import Settings
 from codetr_ros.nodes.errors import NodeError
 from codetr_ros.nodes.peers import Peer
@@ -150,8 +151,8 @@ class Playing(PlayedWiring):
             return
         topic, data = TOPICS[type(record)], given.data
         if record.run_id != self.joined.run.run_id:
-            record = replace(record, run_id=self.joined.run.run_id)
-            data = link.message(record)
+            record, data = replace(record, run_id=self.joined.run.run_id), b''
+        data = data or link.message(record)
         if isinstance(record, Commit):
             self._last.commit(record, data)
             self._log_phase(record)
@@ -278,10 +279,13 @@ class Player:
             return None
         return join(member, lambda: self._make)
 
-    def _make(self, _: RunSpec, settings: Settings, *_more: object) -> Playback:
+    def _make(self, run: RunSpec, settings: Settings, *_more: object) -> Playback:
         learners = [role for role in LEARNERS if role in self._live]
         phases = settings.phases if self._live else self._recorded.phases
-        return Playback(self._items(), phases, settings.ahead, learners, self._pace)
+        recorded = self._recorded.settings
+        lag = None if recorded.free else recorded.lag
+        commits = PlayedCommits(run.run_id, settings, lag, self._live)
+        return Playback(self._items(), phases, settings.ahead, learners, self._pace, commits)
 
     def _wire(self, member: Membership, joined: Joined) -> Playing:
         self._playing = Playing(member, joined, self._recorded, self._live, self._cast)

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import cast
 
 from codetr_ros.bags.definitions import encode, stamp_of
-from codetr_ros.bags.first_labels import FirstLabels
 from codetr_ros.bags.topics import topics_of_run
 from codetr_ros.bags.writer import McapWriter
 from codetr_ros.cores.beside import Beside, Early
@@ -51,7 +50,6 @@ class Recording(Wiring):
         settings, node = joined.settings, member.link.node
         kinds = [kind for kind in TOPICS if kind not in NOT_RECORDED]
         self._full = {kind: node.resolve_topic_name(TOPICS[kind]) for kind in kinds}
-        self._first = FirstLabels(settings) if settings.record_relabels == 'first' else None
         core = cast(Recorder, joined.core)
         self._beside = Beside(joined.run, settings, lambda: core.phase)
         self._early = Early(settings)
@@ -112,10 +110,10 @@ class Recording(Wiring):
 
     def _kept(self, record: Record, raw: bytes) -> bytes:
         """The bytes that the bag keeps of a message: all, or only the first labels if so set."""
-        if self._first is None or not isinstance(record, StepRewards):
+        if not isinstance(record, StepRewards):
             return raw
-        kept = self._first.keep(record)
-        return raw if kept is None else encode(kept, stamp_of(raw))
+        kept = cast(Recorder, self.joined.core).kept(record)
+        return raw if kept is record else encode(kept, stamp_of(raw))
 
     def _write(self, kind: type, raw: bytes, published: int | None = None) -> None:
         now = self.member.link.node.get_clock().now().nanoseconds

@@ -261,6 +261,7 @@ class Process:
             self.world.note(self.name, f'phase {packet.data.phase} came again')
             for kind, raw in packet.data.messages:
                 self.traffic.take_again(kind, raw)
+            self.core.fetched(packet.data.phase)
         else:
             self.take(packet.kind, packet.data)
 
