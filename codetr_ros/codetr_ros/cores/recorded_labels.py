@@ -22,6 +22,7 @@ class RecordedLabels:
         self._parts: dict[int, int] = {}  # phase -> how many
         self._digests: dict[tuple[int, int], bytes] = {}  # (phase, part) ->
         self._first = FirstLabels(settings) if settings.record_relabels == 'first' else None
+        self._restored: dict[tuple[int, int], StepRewards] = {}  # what a bag has of them
         self._last: tuple[StepRewards, StepRewards] | None = None  # taken, and what is kept of it
 
     @property
@@ -65,7 +66,9 @@ class RecordedLabels:
         if (part.phase, part.part) in self._digests:
             return False
         self._digests[part.phase, part.part] = digest
-        kept = self._first.keep(part) if self._first else None
+        kept = self._restored.pop((part.phase, part.part), None)
+        if kept is None and self._first is not None:
+            kept = self._first.keep(part)
         self._last = None if kept is None else (part, kept)
         self._chain.note(part, kept)
         return True
@@ -78,6 +81,7 @@ class RecordedLabels:
         """Note that a bag has labels, reduced to what it keeps: whole, they must come again."""
         if self._first is not None:
             self._first.keep(part)
+        self._restored[part.phase, part.part] = part
 
     def follow(self, phase: int) -> None:
         """Go on behind the commit of a phase, the last that the chain has followed."""
@@ -87,3 +91,5 @@ class RecordedLabels:
             self._parts.pop(named, None)
         for key in [key for key in self._digests if key[0] not in self._parts]:
             del self._digests[key]
+        for key in [key for key in self._restored if key[0] <= phase - self._ahead]:
+            del self._restored[key]
