@@ -198,7 +198,7 @@ def test_a_recorder_commits_from_its_first_phase_without_a_commit(kept):
             said.append(each)
         while (made := next(work)) is not None:
             said += made
-            labels = [labels_of(made[0])]
+            labels = [labels_of(made[-1])]
             whole.receive(labels[0])
             said += [whole.kept(labels[0])]
             published_labels += labels

@@ -15,12 +15,11 @@ from codetr_ros.records import (
     Record,
     RecordError,
     RunSpec,
-    StepRewards,
     Transitions,
     TrueRewards,
     describe,
 )
-from codetr_ros.records.checks import check_labels, check_run
+from codetr_ros.records.checks import check_run
 
 
 class Early:
@@ -79,8 +78,6 @@ class Beside:
         self._run = run
         self._settings = settings
         self._committed = committed
-        self._parts: tuple[int, int] = (-1, 0)  # phase of the newest labels, and parts of it
-        self._seen: set[int] = set()  # of these parts
         self._due: Counter[str] = Counter()  # next sequence number of true rewards, by source
         self.duplicated: Counter[str] = Counter()
 
@@ -91,9 +88,7 @@ class Beside:
             RecordError: it must be refused; nothing has changed then.
         """
         check_run(record, self._run)
-        if isinstance(record, StepRewards):
-            self._labels(record)
-        elif isinstance(record, TrueRewards):
+        if isinstance(record, TrueRewards):
             self._true_rewards(record)
         elif isinstance(record, EpisodeResult):
             self._within(record, record.version, -1, self._settings.phases - 1, 'version')
@@ -107,22 +102,6 @@ class Beside:
             raise RecordError(
                 f'{describe(record)}: {name} must be from {least} to {most} in this run'
             )
-
-    def _labels(self, record: StepRewards) -> None:
-        check_labels(record, self._settings)
-        self._within(record, record.phase, 0, self._committed() - 1, 'phase')
-        phase, parts = self._parts
-        if record.phase < phase or (record.phase == phase and record.part in self._seen):
-            self.duplicated[TOPICS[StepRewards]] += 1
-            return
-        if record.phase == phase and record.parts != parts:
-            raise RecordError(
-                f'{describe(record)}: others of the phase are of {parts} parts: two reward nodes? '
-                'Stop one of them'
-            )
-        if record.phase > phase:
-            self._parts, self._seen = (record.phase, record.parts), set()
-        self._seen.add(record.part)
 
     def _true_rewards(self, record: TrueRewards) -> None:
         settings, due = self._settings, self._due[record.source]

@@ -9,11 +9,12 @@ from codetr_ros.cores.announced import Tasks
 from codetr_ros.cores.left_out import Absent
 from codetr_ros.records import TOPICS, Commit, RecordError, describe
 from codetr_ros.records.digests import digest
+from codetr_ros.records.shown import worth_a_line
 
 _log = logging.getLogger(__name__)
 
 MOST_HELD = 4
-"""Commits of one phase that are held; whoever sends more of them floods."""
+"""Commits of one phase that are held at a time; whoever sends more of them floods."""
 
 
 class Commits:
@@ -64,6 +65,10 @@ class Commits:
         """The digest of the commit of a phase that was taken; empty if it was not."""
         return self._digests[phase] if 0 <= phase < len(self._digests) else ''
 
+    def candidates(self, phase: int) -> list[str]:
+        """The digests of the commits of a phase that may be right."""
+        return list(self._held.get(phase, {}))
+
     def of(self, phase: int) -> list[Commit]:
         """The commits of a phase that may be right, in the order of their arrival."""
         return list(self._held.get(phase, {}).values())
@@ -79,13 +84,11 @@ class Commits:
             return False
         if text := self.contradiction(commit):
             raise RecordError(f'{describe(commit)} {text}')
-        held = self._held.setdefault(commit.phase, {})
-        if len(held) == MOST_HELD:
-            raise RecordError(
-                f'{describe(commit)} is one of more than {MOST_HELD} that contradict each other: '
-                'stop what publishes them'
-            )
-        held[own] = commit
+        held = self.of(commit.phase)
+        if len(held) == MOST_HELD:  # of a flood, the newest stay: what is fetched is the newest
+            self.refuse(held[0], 'is one of too many that contradict each other')
+            self._missed.add(commit.phase)
+        self._held.setdefault(commit.phase, {})[own] = commit
         return True
 
     def contradiction(self, commit: Commit) -> str:
@@ -154,7 +157,9 @@ class Commits:
         held = self._held.get(commit.phase, {})
         if held.pop(digest(commit), None) is not None:
             self._refused[TOPICS[Commit]] += 1
-            _log.error('refused: %s %s', describe(commit), text)
+            number = self._refused[TOPICS[Commit]]
+            if worth_a_line(number):
+                _log.error('refused later (number %s): %s %s', number, describe(commit), text)
 
     def take(self, commit: Commit) -> None:
         """Go on behind a commit whose records have its digests; the others of its phase go."""

@@ -1,10 +1,12 @@
 """Labels that a learner holds until the phase that they were made of is learnt from."""
 
+from collections.abc import Collection
+
 from codetr_ros.records import RecordError, StepRewards, describe
 from codetr_ros.records.digests import raw_digest
 
 MOST_CLAIMS = 4
-"""Commits of one phase of which labels may claim to be made; whoever names more of them floods."""
+"""Commits of one phase that labels may claim to be made of, at a time."""
 
 
 class HeldLabels:
@@ -16,20 +18,22 @@ class HeldLabels:
     """
 
     def __init__(self) -> None:
+        self.dropped = 0
+        """Parts that went because more than `MOST_CLAIMS` commits of a phase were claimed."""
         self._held: dict[int, dict[str, dict[int, StepRewards]]] = {}
 
-    def add(self, part: StepRewards) -> bool:
+    def add(self, part: StepRewards, commits: Collection[str] = ()) -> bool:
         """Hold one part; returns whether it is new.
+
+        Args:
+            part: the labels.
+            commits: digests of the commits of the phase that have come. Of a flood of claims,
+                those of other commits go first.
 
         Raises:
             RecordError: it contradicts those that are held; nothing has changed then.
         """
         claims = self._held.get(part.phase, {})
-        if part.commit not in claims and len(claims) == MOST_CLAIMS:
-            raise RecordError(
-                f'{describe(part)}: labels of phase {part.phase} claim more than {MOST_CLAIMS} '
-                'commits that it is made of: stop what publishes them'
-            )
         parts = claims.get(part.commit, {})
         others = next((one.parts for one in parts.values()), part.parts)
         if part.part >= part.parts or part.parts != others:
@@ -45,6 +49,9 @@ class HeldLabels:
                     'reward nodes? Stop one of them'
                 )
             return False
+        if part.commit not in claims and len(claims) == MOST_CLAIMS:
+            gone = next((claim for claim in claims if claim not in commits), next(iter(claims)))
+            self.dropped += len(claims.pop(gone))
         self._held.setdefault(part.phase, {}).setdefault(part.commit, {})[part.part] = part
         return True
 

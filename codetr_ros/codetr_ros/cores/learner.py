@@ -90,8 +90,12 @@ class Learner(Consumer):
                 f'{describe(record)} was made of the commit {record.commit!r}; that of phase '
                 f'{record.phase} is {made_of!r}: stop the second reward node'
             )
-        if record.phase < self._applied or not self._labels.add(record):
+        dropped = self._labels.dropped
+        commits = self._intake.commits.candidates(record.phase)
+        if record.phase < self._applied or not self._labels.add(record, commits):
             self.duplicated[TOPICS[StepRewards]] += 1
+        if self._labels.dropped > dropped:
+            self.refused[TOPICS[StepRewards]] += self._labels.dropped - dropped
 
     def _begin(self) -> Iterator[list[Record]]:
         spec = self._intake.tasks.first
