@@ -21,6 +21,7 @@ from codetr_ros.records import (
     StepRewards,
     Transitions,
 )
+from codetr_ros.records.chain import Chain
 from helpers.builders import commit, policy, run, score, task_spec, tiny, transitions
 from helpers.cores import slices
 
@@ -211,16 +212,20 @@ class Reward:
         self.work = self.core.work()
         self.core.receive(task_spec(horizon=1000))
         self.given = {}
+        self.chain = Chain(self.settings.lag)
         self.last = None
 
     def judge(self, *judgements):
         for each in judgements:
             self.given[each.scorer] = each.sequence
+            self.chain.note(each)
             self.core.receive(each)
 
     def phase(self, phase):
         """Ends a phase, whose commit names all that was given before."""
-        chunk = transitions(sequence=phase, phase=phase, first_step=200 * phase, steps=200)
+        chunk = transitions(
+            sequence=phase, phase=phase, first_step=200 * phase, steps=200, phase_end=True
+        )
         if self.last is not None:
             chunk.observations[0] = self.last.observations[-1]
         self.last = chunk
@@ -228,7 +233,13 @@ class Reward:
         names = tuple(sorted(self.given))
         last = np.array([self.given[name] for name in names], np.int64)
         number = np.array([phase], np.int64)
-        self.core.receive(commit(phase=phase, transitions=number, scorers=names, scores=last))
+        self.chain.note(chunk)
+        made = commit(phase=phase, transitions=number, scorers=names, scores=last)
+        before = self.core._settings.labels_named(phase)
+        labels = self.core._intake.labels.get(before, '')
+        made = replace(self.chain.completed(made), labels_digest=labels)
+        self.chain.follow(made)
+        self.core.receive(made)
         return slices(self.work)
 
     @property
