@@ -64,6 +64,8 @@ def test_the_bag_of_a_free_run_teaches_the_reward_model_the_same_weights(a_free_
     said = json.loads((tmp_path / 'out' / 'summary.json').read_text())
     report = a_free_run.labeller.report()
     assert said['reward_model_sha256'] == report.reward_model_sha256
+    assert said['recorded_labels']['same'] > 0
+    assert said['recorded_labels']['other'] == 0
     found = verify(bag)
     assert found.sound, found.findings.named
 

@@ -9,6 +9,7 @@ import pytest
 from codetr_ros import config
 from codetr_ros.processes import launcher
 from codetr_ros.processes.launcher import Command, LaunchError, Node, Processes
+from helpers.builders import tiny
 from helpers.executables import prefix
 from helpers.programs import (
     DEAF,
@@ -258,3 +259,21 @@ def test_the_end_of_a_log_is_shown_whatever_is_in_it(tmp_path: Path) -> None:
 
     assert launcher.end_of_log(log, lines=2) == '\ufffd\ufffd\nlast'
     assert 'cannot be read: No such file' in launcher.end_of_log(tmp_path / 'none')
+
+
+def test_a_run_on_a_robot_starts_the_robot_node_in_place_of_simulators(tmp_path):
+    settings = tiny(task='robot/arm', pace='free', evaluate_every=0)
+    there = prefix(tmp_path)
+    (there / 'lib/sim_node/robot').write_text('')
+    (there / 'lib/sim_node/robot').chmod(0o755)
+    robot = {'mapping': '/a b/m.yaml', 'autostart': True}
+    made = launcher.commands(
+        settings, 'run', tmp_path, {'AMENT_PREFIX_PATH': str(there)}, robot=robot
+    )
+    assert [(c.name, c.role) for c in made] == [
+        ('robot', 'sim'), ('reward', 'reward'), ('record', 'record'), ('learner', 'learner'),
+    ]  # fmt: skip
+    words = made[0].arguments
+    assert words[0].endswith('lib/sim_node/robot')
+    assert 'mapping:="/a b/m.yaml"' in words
+    assert 'autostart:=true' in words

@@ -138,7 +138,7 @@ def fold(
                     'on what is there'
                 )
             folded.phases = record.phase + 1
-            folded.recorded.forget(record.phase - settings.lag)
+            folded.recorded.forget(record.phase - settings.ahead)
             progress(folded.phases, settings.phases)
     core.close()
     return folded

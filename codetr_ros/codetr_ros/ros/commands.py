@@ -16,7 +16,7 @@ from codetr_ros.robots.live import Command
 from codetr_ros.robots.mapping import Action
 
 _SEQUENCE = re.compile(r'sequence<([\w/]+)(?:, \d+)?>$|([\w/]+)\[\d+\]$')
-_NUMBERS = re.compile(r'(u?int\d+|float|double|octet|long double)$')
+_NUMBERS = re.compile(r'(float|double|long double)$')
 
 
 def message_class(name: str) -> Any:
@@ -97,20 +97,13 @@ class CommandMessages:
         if hasattr(place, 'time_from_start'):
             place.time_from_start = self._duration
         name, index = _split(last)
-        self._kind(place, name, path)
-        try:
-            if index is None:
-                setattr(place, name, value)
-            else:
-                held = list(getattr(place, name))
-                held += [0.0] * (index + 1 - len(held))
-                held[index] = value
-                setattr(place, name, held)
-        except (AssertionError, TypeError) as error:
-            raise NodeError(
-                f'mapping: action.fields: {path!r} of {self._name} takes no floating-point '
-                f'number: {str(error).splitlines()[0]}'
-            ) from None
+        if index is None:
+            setattr(place, name, value)
+            return
+        held = list(getattr(place, name))
+        held += [0.0] * (index + 1 - len(held))
+        held[index] = value
+        setattr(place, name, held)
 
     def _child(self, place: Any, part: str, path: str) -> Any:
         name, index = _split(part)
@@ -153,7 +146,8 @@ class CommandMessages:
         number = (element[1] or element[2]) if element else kind
         if not _NUMBERS.match(number):
             raise NodeError(
-                f'mapping: action.fields: {path!r} of {self._name} is a {kind}, no number'
+                f'mapping: action.fields: {path!r} of {self._name} is a {kind}, no '
+                'floating-point number'
             )
         return element is not None and index is None
 

@@ -101,6 +101,11 @@ OWN_OF_ROLE: dict[str, dict[str, Own]] = {
             'true: drive the robot as soon as everybody is there; false: wait until somebody '
             'activates it (lifecycle of <node>_driver)',
         ),
+        'real_time': Own(
+            True,
+            'ask the system for real-time scheduling, so that what computes beside this node does '
+            'not delay control steps; where that is not allowed, it is logged',
+        ),
     },
     'record': {
         'bag': Own(

@@ -1,5 +1,6 @@
 """The wiring of a robot's core: to the topics of its run, and through the driver to its own."""
 
+import gc
 import time
 from collections.abc import Sequence
 from typing import Any, cast
@@ -10,6 +11,7 @@ from codetr_ros.ros.gathering import IDLE, wait_for
 from codetr_ros.ros.joining import Joined
 from codetr_ros.ros.membership import Membership
 from codetr_ros.ros.wiring import Wiring
+from codetr_ros.system.scheduling import real_time
 
 SAY_EVERY = 10.0  # [s] between two lines about the same reason for which the robot is held
 
@@ -68,6 +70,7 @@ class RobotWiring(Wiring):
 
     def _begin(self) -> None:
         self._begun = True
+        self._hurry()
         assert self._driver is not None
         if self.member.values['autostart']:
             self._driver.trigger_activate()
@@ -76,6 +79,12 @@ class RobotWiring(Wiring):
                 f'the robot is not moved before {self._driver.get_fully_qualified_name()} is '
                 'activated (`ros2 lifecycle set`, or the parameter autostart)'
             )
+
+    def _hurry(self) -> None:
+        """Let nothing delay a control step that can be kept from it."""
+        gc.freeze()  # a collection would go through all of torch
+        if self.member.values['real_time'] and (reason := real_time()):
+            self.log.warning(f'control steps have no real-time scheduling: {reason}')
 
     def pause(self) -> float:
         """Seconds until the next control step is due, at most those that a signal waits."""

@@ -1,0 +1,29 @@
+"""Examples are named, and refused where their parts are not there."""
+
+import pytest
+
+from codetr_ros import cli
+
+
+def test_without_a_name_the_examples_are_listed(capsys):
+    assert cli.main(['demo']) == 2
+    assert 'a robot in real time' in capsys.readouterr().out
+    assert cli.main(['demo', '--help']) == 0
+
+
+def test_an_unknown_example_is_refused_with_the_one_that_is_close(capsys):
+    assert cli.main(['demo', 'robt']) == 2
+    assert "there is no command 'demo robt' (did you mean robot?)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('flags', 'said'),
+    [
+        (['--example', 'none'], 'the stand-in robot is not in none: start from the folder of'),
+        (['--seed', '-1'], 'seed = -1'),
+    ],
+)
+def test_what_cannot_be_started_is_refused(flags, said, capsys, tmp_path):
+    assert cli.main(['demo', 'robot', *flags, '--out', str(tmp_path / 'run')]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / 'run').exists()
