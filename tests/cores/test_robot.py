@@ -185,3 +185,17 @@ def test_a_run_that_is_none_of_a_robot_is_refused(changes, said):
     settings = tiny(**({'task': 'robot/arm', 'evaluate_every': 0} | changes))
     with pytest.raises(SettingsError, match=said):
         Robot(run(settings), settings, 'robot', rules(), Clock())
+
+
+def test_a_clock_that_is_set_back_cuts_the_episode_and_control_goes_on():
+    bench = Bench(pace='free')
+    bench.permit(0)
+    bench.step(3)
+    bench.clock.now -= 50.0
+    bench.step(8)
+    first = bench.of(Transitions)[0]
+    assert (first.steps, first.truncated) == (2, True)
+    assert any(bench.sent[-1]) and bench.robot.control.held is None
+    counters = bench.robot.report().counters
+    assert counters['times that the clock went back'] == 1
+    assert 'control deadlines missed' not in counters
