@@ -186,3 +186,23 @@ def test_the_delay_is_that_of_the_run_or_else_the_longest_segment(tmp_path):
     longer = index(tmp_path / 'c', [run(), *steps(9, [0]), *scores((0, 9))])
     assert longer.facts()['delay'] == 9
     assert longer.notes == ['delay = 9, the longest scored segment: a run in the bags has 7']
+
+
+def judged(scorer, sequence, first_step, value):
+    return score(scorer=scorer, sequence=sequence, first_step=first_step, length=7, value=value)
+
+
+def test_scores_of_several_on_scales_of_their_own_are_brought_to_one_and_corrections_count(
+    tmp_path,
+):
+    worth = [1.0, 4.0, 2.0, 5.0, 3.0, 2.5, 4.5, 1.5, 3.5, 5.5]
+    ann = [judged('ann', n, 7 * n, 0.0) for n in range(10)]
+    ann += [judged('ann', 10 + n, 7 * n, value) for n, value in enumerate(worth)]
+    ben = [judged('ben', n, 7 * n, 100 + 10 * value) for n, value in enumerate(worth)]
+    settings = tiny(scorer='topic')
+    records = [run(settings), task_spec(), transitions(steps=70), *ann, *ben]
+    found = index(tmp_path, records)
+    (episode,) = found.episodes.values()
+    assert found.skipped['scores that their scorer has corrected'] == 10
+    assert (found.scores, list(episode.firsts)) == (10, [7 * n for n in range(10)])
+    assert np.abs(np.array(episode.values) - worth).max() < 0.1

@@ -16,9 +16,10 @@ import numpy as np
 
 from codetr_ros.bags.reader import Bag
 from codetr_ros.config import Settings, SettingsError, load
+from codetr_ros.offline import judged
 from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.sources import settings_of
-from codetr_ros.records import CompositeReward, RunSpec, TaskSpec, Transitions
+from codetr_ros.records import CompositeReward, Preference, RunSpec, TaskSpec, Transitions
 from codetr_ros.records.checks import LARGEST_SCORE, usable_score
 
 UNKNOWN_TASK = 'unknown'
@@ -33,6 +34,8 @@ TOO_LARGE = f'scores beyond {LARGEST_SCORE:g}'
 NO_STEPS = 'scores of steps that are not all there'
 OVERLAP = 'scores of steps that another score covers'
 TOO_LONG = 'scores of more steps than the delay'
+CORRECTED = 'scores that their scorer has corrected'
+COMPARED = 'preferences, which are learnt from with --schedule phases'
 
 
 class Key(NamedTuple):
@@ -68,6 +71,7 @@ class Episode:
     firsts: 'array[int]' = field(default_factory=lambda: array('q'))
     lengths: 'array[int]' = field(default_factory=lambda: array('q'))
     values: 'array[float]' = field(default_factory=lambda: array('d'))
+    scorers: list[str] = field(default_factory=list)
 
     def follows(self, chunk: Transitions) -> Piece | None:
         """The piece that a chunk continues, if any."""
@@ -102,6 +106,8 @@ class Index:
     phases: Counter[Key] = field(default_factory=Counter)  # that have begun
     _prints: dict[tuple[str, str, int, bytes], int] = field(default_factory=dict)
     _copies: set[tuple[Key, int]] = field(default_factory=set)
+    # runs that others than the simulator scored: number of the bag, run id
+    _judged: set[tuple[int, str]] = field(default_factory=set)
     _first: str = ''  # the source that set the sizes
 
     def read(self) -> 'Index':
@@ -111,7 +117,7 @@ class Index:
             BagError: one cannot be read.
             FitError: the bags have different sizes or composite rewards, or nothing to learn from.
         """
-        kinds = (RunSpec, TaskSpec, Transitions, CompositeReward)
+        kinds = (RunSpec, TaskSpec, Transitions, CompositeReward, Preference)
         for number, bag in enumerate(self.bags):
             for entry in bag.entries(kinds):
                 record = entry.record
@@ -128,6 +134,9 @@ class Index:
                     self._take(key, record)
                 elif isinstance(record, CompositeReward):
                     self._score(Key(number, record.run_id, record.source), record)
+                elif isinstance(record, Preference):
+                    self.skipped[COMPARED] += 1
+        self._settle()
         if not self.steps:
             raise FitError(
                 f'{", ".join(str(b.path) for b in self.bags)}: no Transitions'
@@ -159,6 +168,8 @@ class Index:
                     'fit them apart'
                 )
         self.settings.append(mine)
+        if mine.scored_elsewhere:
+            self._judged.add((number, run.run_id))
 
     def _task(self, number: int, spec: TaskSpec) -> None:
         who = f'{spec.source!r} in {self.bags[number].path}'
@@ -243,6 +254,10 @@ class Index:
         episode = self.episodes.get(place)
         if episode is None:  # its steps may follow: topics are not ordered among each other
             episode = self.episodes[place] = Episode(key, reward.episode)
+        if key[:2] in self._judged and self._corrects(episode, reward):
+            self.skipped[CORRECTED] += 1
+            return
+        episode.scorers.append(reward.scorer)
         episode.firsts.append(reward.first_step)
         episode.lengths.append(reward.length)
         episode.values.append(reward.value)
@@ -250,6 +265,26 @@ class Index:
             self.unscored += 1
         else:
             self.scores += 1
+
+    @staticmethod
+    def _corrects(episode: Episode, reward: CompositeReward) -> bool:
+        """Whether a score replaces one of the same scorer, which it does then."""
+        same = (reward.first_step, reward.length, reward.scorer)
+        there = zip(episode.firsts, episode.lengths, episode.scorers, strict=True)
+        for at, known in enumerate(there):
+            if known == same:
+                episode.values[at] = reward.value
+                return True
+        return False
+
+    def _settle(self) -> None:
+        """Bring the scores of several scorers to one scale, run by run."""
+        for run in sorted(self._judged):
+            judged.settle(e for e in self.episodes.values() if e.key[:2] == run)
+        if self._judged:
+            every = [value for e in self.episodes.values() for value in e.values]
+            self.unscored = int(np.isnan(every).sum())
+            self.scores = len(every) - self.unscored
 
     @property
     def longest(self) -> int:
