@@ -76,7 +76,7 @@ def test_over_topics_and_in_process_end_with_the_same_weights(tmp_path, task, me
         folder = tmp_path / 'topics' / 'checkpoints'
         replayed = replay(Bag(topics['bag']), folder)
         assert replayed.first is None
-        assert replayed.same['checkpoint of the learner'] == 3
+        assert replayed.same['checkpoint of the learner'] == 4
 
 
 @pytest.mark.slow
