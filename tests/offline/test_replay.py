@@ -72,9 +72,6 @@ CHANGES = {
         2, 'labels', StepRewards, lambda r: r.phase == 2 and len(r.labels),
         {'labels': lambda labels: np.nextafter(labels, np.float32(9))},
     ),
-    'a score': (
-        1, 'labels', CompositeReward, lambda r: r.sequence == 3, {'value': lambda v: v + 0.5},
-    ),
 }  # fmt: skip
 
 
@@ -85,6 +82,21 @@ def test_the_first_phase_that_differs_is_named(what, run, tmp_path):
     replayed = replay(Bag(bag))
     assert (replayed.first.phase, replayed.first.what) == (phase, kind)
     assert str(replayed.first).startswith(f'phase {phase}: {kind} made here: ')
+
+
+def test_a_run_whose_weights_come_out_otherwise_names_their_first_phase(run, tmp_path):
+    """As on a machine with other last bits: here with another learning rate."""
+    other = SETTINGS.changed({'sac.actor_learning_rate': 0.02}).run_spec('run')
+    replayed = replay(Bag(write(tmp_path / 'bag', [other, *run[1][1:]])))
+    assert (replayed.first.phase, replayed.first.what) == (1, 'policy')
+    assert any('the policy that permitted phase 2' in what for what in replayed.differences)
+
+
+def test_a_score_that_is_not_the_commits_is_named_too(run, tmp_path):
+    records = changed(run[1], CompositeReward, lambda r: r.sequence == 3, value=lambda v: v + 0.5)
+    replayed = replay(Bag(write(tmp_path / 'bag', records)))
+    assert replayed.first.phase == 0
+    assert "commit, composite_rewards 0 to 35 of 'sim' have the digest" in str(replayed.first)
 
 
 def test_the_command_prints_where_the_run_was_made_and_what_it_compared(run, capsys):

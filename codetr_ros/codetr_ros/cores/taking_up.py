@@ -300,6 +300,14 @@ class _Past:
                     busy = True
                     for record in records:
                         self._note(name, record)
+        for consumer in self._consumers.values():
+            if consumer.missing is not None:
+                raise RecordError(
+                    f'phase {consumer.missing} cannot be learnt from again: '
+                    f'{consumer.doubt or "the bag lacks some of it"}. Weights that are made here '
+                    'are not those of the run, or its bag was changed: go on with the run on the '
+                    'machine that began it, or restore bag and checkpoints from a copy'
+                )
 
     def _note(self, name: str, record: Record) -> None:
         if isinstance(record, StepRewards):

@@ -26,6 +26,10 @@ from codetr_ros.runs import checkpoints
 from codetr_ros.runs.reports import CoreReport, StartedFrom
 
 
+class _DiffersError(Exception):
+    """A phase that differs from what its commit states of it."""
+
+
 @dataclass(frozen=True)
 class Difference:
     """Something that is not as the run had it."""
@@ -105,11 +109,14 @@ def replay(
     kinds = {TrueRewards, Commit, StepRewards, Policy}
     kinds.update(kind for side in sides.values() for kind in side.subscribes)
     ours = (e for e in bag.entries(kinds) if e.record.run_id == recorded.run.run_id)
-    for entry in causal(ours, settings.lag):
-        steps.take(entry.record)
-        if isinstance(entry.record, Commit):
-            steps.learn(entry.record.phase, bag.path)
-            progress(replayed.phases, recorded.phases)
+    try:
+        for entry in causal(ours, settings.lag):
+            steps.take(entry.record)
+            if isinstance(entry.record, Commit):
+                steps.learn(entry.record.phase, bag.path)
+                progress(replayed.phases, recorded.phases)
+    except _DiffersError:
+        pass  # it is among the differences, and nothing can be learnt behind it
     replayed.reports = {name: side.report() for name, side in sides.items()}
     return replayed
 
@@ -159,14 +166,26 @@ class _Steps:
                     for record in records:
                         self._note(record)
                 if self._sides[name].missing is not None:
-                    raise FitError(
-                        f'{path}: phase {phase} is committed, but not all that belongs to it is '
-                        'in the bag: `codetr bag verify` names what is missing'
-                    )
+                    self._stop(phase, self._sides[name].doubt, path)
         self._replayed.phases = phase + 1
         lag = self._replayed.recorded.settings.lag
         self._labels = {key: one for key, one in self._labels.items() if key[0] >= phase - lag}
         self._check(phase)
+
+    def _stop(self, phase: int, doubt: str, path: Path) -> None:
+        """End where a phase cannot be taken in.
+
+        Raises:
+            FitError: the bag lacks some of it.
+            _DiffersError: something differs from what its commit states.
+        """
+        if not doubt:
+            raise FitError(
+                f'{path}: phase {phase} is committed, but not all that belongs to it is in the '
+                'bag: `codetr bag verify` names what is missing'
+            )
+        self._replayed.compare(phase, f'commit, {doubt}', 'another', 'as stated')
+        raise _DiffersError
 
     def _note(self, record: Record) -> None:
         if isinstance(record, StepRewards):
