@@ -90,6 +90,17 @@ def test_a_recorder_killed_while_it_makes_the_bag_whole_leaves_it_as_it_was(kill
     assert contents(torn) == [raw_of(record) for record in a_run()]
 
 
+def test_a_phase_is_read_from_a_file_that_was_made_whole(killed, tmp_path):
+    folder, _ = killed
+    torn = tmp_path / 'bag'
+    shutil.copytree(folder, torn)
+    phases = Phases()
+    reopen(torn, lambda raw: phases.note(Bag(torn).entry(raw).record, raw.place))
+    found = [list(phases.read(phase)) for phase in range(3)]
+    assert [messages[-1][0] for messages in found] == [Commit] * 3
+    assert len({len(messages) for messages in found}) == 1
+
+
 def test_a_closed_bag_is_gone_on_with_in_a_new_file(tmp_path):
     writer = McapWriter(tmp_path / 'bag', own_topics())
     write(writer, a_run())

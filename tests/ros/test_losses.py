@@ -78,6 +78,9 @@ def test_a_node_gives_up_on_what_was_lost_for_good_naming_topic_and_count(play):
     play = play(settings=settings(), roles=('learner', 'sim', 'record'))
     with process('deaf', 'peer_deadline:=7.0') as deaf:  # and nobody offers to send anything again
         play.until(lambda: read_by(play, 'reward'), deaf)
+        play.until(
+            lambda: [p for p in play.presence_of('reward') if 'for messages' in p.doing], deaf
+        )
         publish_a_phase(play)
         play.links['record'].publish(
             commit(scores=np.zeros(1, np.int64)),
@@ -188,7 +191,8 @@ def test_what_the_core_has_not_taken_is_not_sent_again(play, tmp_path):
         sim.publish(transitions(sequence=3))
         sim.publish(transitions(run_id='another'))
         play.links['reward'].publish(step_rewards(run_id='another'))
-        refused = [('refused step_rewards', '1'), ('refused transitions', '3')]
+        play.claimed = {'transitions': -1, 'step_rewards': -1}  # those are not of this run
+        refused = [('refused step_rewards', '1'), ('refused transitions', '2')]
         play.until(
             lambda: any(
                 [(v.key, v.value) for v in s.values if v.key.startswith('refused')] == refused
@@ -208,12 +212,12 @@ def test_what_the_core_has_not_taken_is_not_sent_again(play, tmp_path):
         play.until(lambda: node.poll() is not None)
         said = output(node)
     assert node.returncode == 0, said
-    assert [type(record) for record in sent] == [Transitions, CompositeReward, Commit]
-    assert np.isfinite(sent[0].observations).all()
+    assert [type(record) for record in sent] == [Policy, Transitions, CompositeReward, Commit]
+    assert np.isfinite(sent[1].observations).all()
     with AnyReader([tmp_path / 'bag']) as bag:
         runs = {bag.deserialize(raw, c.msgtype).run_id for c, _, raw in bag.messages()}
     assert runs == {'run'}
     report = json.loads(run_folder.report_path(tmp_path, 'record', 'record').read_text())
-    assert report['refused'] == {'transitions': 3, 'step_rewards': 1}
-    assert report['recorded']['transitions'] == 1  # what is refused is not recorded
+    assert report['refused'] == {'transitions': 2, 'step_rewards': 1}
+    assert report['recorded']['transitions'] == 1  # only what is sound
     assert 'step_rewards' not in report['recorded']

@@ -24,7 +24,12 @@ def recorder(play, tmp_path):
     """The wiring of a recorder with its bag open, among no peers."""
     play = play(roles=())
     member = Membership('record', 'record', Stop())
-    member.values = {'bag': str(tmp_path / 'bag'), 'bag_split_mb': 0.0, 'bag_keep_free_mb': 0.0}
+    member.values = {
+        'peer_deadline': 60.0,
+        'bag': str(tmp_path / 'bag'),
+        'bag_split_mb': 0.0,
+        'bag_keep_free_mb': 0.0,
+    }
     member.announcement = member.link.message(play.spec)
     member.link.advertise(['run', 'commits'])
     core = Recorder(play.spec, play.settings, 'record')

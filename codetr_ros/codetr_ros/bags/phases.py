@@ -9,6 +9,7 @@ from codetr_ros.bags.errors import BagError, Place
 from codetr_ros.bags.files import bag_files
 from codetr_ros.bags.mcap_channels import McapChannels
 from codetr_ros.bags.mcap_file import McapFile
+from codetr_ros.bags.mcap_layout import summary_records
 from codetr_ros.bags.raw import RawMessage
 from codetr_ros.records import (
     Commit,
@@ -17,6 +18,7 @@ from codetr_ros.records import (
     Preference,
     Record,
     Transitions,
+    TrueRewards,
 )
 from codetr_ros.records.fields import RECORD_TYPES, type_name
 from codetr_ros.records.identity import identity
@@ -24,6 +26,9 @@ from codetr_ros.records.numbering import Judgement
 
 NAMED = (Policy, Transitions, CompositeReward, Preference, Commit)
 """The kinds of records that belong to a phase by their number or by its commit."""
+ON_REQUEST = (TrueRewards,)
+"""Those that are read where they are asked for. They may come late: one that came after the commit
+is not among them."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +44,7 @@ class _Phase:
         """Whether a record belongs to the phase."""
         if isinstance(record, (Policy, Commit)):
             return record.phase == self.commit.phase
-        if isinstance(record, Transitions):
+        if isinstance(record, (Transitions, TrueRewards)):
             of, name = ('sources', 'transitions'), record.source
         elif isinstance(record, Judgement):
             of, name = ('scorers', 'scores'), record.scorer
@@ -114,22 +119,24 @@ class Phases:
         if phase not in self._phases:
             held = 'none yet' if self.newest is None else f'0 to {self.newest}'
             raise KeyError(f'phase {phase} is not committed; these are: {held}')
-        wanted = {type_name(kind) for kind in NAMED}
-        if kinds:
-            wanted &= set(kinds)
+        known = (*NAMED, *ON_REQUEST) if kinds else NAMED
+        wanted = {type_name(kind) for kind in known if not kinds or type_name(kind) in kinds}
         return self._read(self._phases[phase], wanted)
 
     def _read(self, phase: _Phase, wanted: set[str]) -> Iterator[tuple[type[Record], bytes]]:
         seen = set()
         for message in self._between(phase.begin, phase.end):
-            if message.channel.type not in wanted:
+            kind = RECORD_TYPES.get(message.channel.type)
+            if kind is None or (message.channel.type not in wanted and kind is not Commit):
                 continue
-            kind = RECORD_TYPES[message.channel.type]
             record = decode(kind, message.data)
             key = kind, identity(record)
             if phase.holds(record) and key not in seen:
                 seen.add(key)
-                yield kind, bytes(message.data)
+                if message.channel.type in wanted:
+                    yield kind, bytes(message.data)
+                if kind is Commit:
+                    return  # a file that is still written to has no end behind it
 
     def _between(self, begin: Place, end: Place) -> Iterator[RawMessage]:
         """All messages from one chunk of the bag to another."""
@@ -143,11 +150,15 @@ class Phases:
                 yield message
 
     def _topics_of(self, path: Path) -> McapChannels:
-        """The topics of a file, which its first chunk describes."""
+        """The topics of a file: our recorder describes all of them in the first chunk, other
+        writers at the file's end.
+        """
         if path not in self._described:
             file = McapFile(path)
             if next(file.messages(), None) is None:
                 raise BagError(f'{path} holds no message any more: restore it from a copy')
+            with path.open('rb') as stream:
+                file.described.borrow(summary_records(stream, path.stat().st_size))
             self._described[path] = file.described
         return self._described[path]
 

@@ -174,7 +174,12 @@ def from_bag(
     walls = [r.wall_s for r in found.reports.values() if r.wall_s is not None]
     summary.end(before.wall_s if before else max(walls, default=seconds))
     named = {
-        name: r.model_copy(update={'exit_code': before.processes[name].exit_code})
+        name: r.model_copy(
+            update={
+                'exit_code': before.processes[name].exit_code,
+                'restarts': before.processes[name].restarts,
+            }
+        )
         if before and name in before.processes
         else r
         for name, r in found.reports.items()

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from codetr_ros import config
 from codetr_ros.cli import FAILED, INTERRUPTED, beside, refuse, results, resume, train_in_process
@@ -23,7 +23,14 @@ from codetr_ros.config import Settings, SettingsError
 from codetr_ros.processes import launcher
 from codetr_ros.processes.launcher import LaunchError
 from codetr_ros.processes.openmp import crowded, threading_environment
-from codetr_ros.processes.supervise import Interrupts, Silence, supervise, why_it_gave_up
+from codetr_ros.processes.restarts import Restarts
+from codetr_ros.processes.supervise import (
+    Interrupts,
+    Silence,
+    is_over,
+    supervise,
+    why_it_gave_up,
+)
 from codetr_ros.records import Record
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import origin
@@ -56,12 +63,14 @@ class Topics:
         peer_deadline: seconds that they wait for each other; 0: for ever.
         start: starts each.
         robot: parameters of the robot node, where the task is that of a robot.
+        restarts: how often one that was killed is started again.
     """
 
     namespace: str | None = None
     peer_deadline: float = PEER_DEADLINE
     start: launcher.Start = launcher.start_program
     robot: Mapping[str, str | bool] | None = None
+    restarts: Restarts = dataclasses.field(default_factory=Restarts)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,14 +147,23 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
     namespace = extra['namespace']
     if begun is not None:
         run_id, namespace = begun.run_id, begun.namespace
-    topics = None if in_process else Topics(namespace, extra['peer_deadline'], start)
+    topics = None if in_process else _topics(extra, namespace, start)
     command = shlex.join(['codetr', 'train', *arguments])
     shown = Shown(extra['film'], extra['tensorboard'], extra['watch'])
     try:
-        with held(folder):
+        with held(folder, launcher.STOP_DEADLINE if begun else 0.0) as lock:
+            if topics is not None and topics.start is launcher.start_program:
+                # nodes hold the folder too: if this process is killed, they need a while to end
+                holding = partial(launcher.start_program, keep_open=(lock,))
+                topics = dataclasses.replace(topics, start=holding)
             return train(settings, run_id, folder, topics, command, shown, extra['bag'], begun)
     except RunFolderError as error:
         return refuse(str(error))
+
+
+def _topics(extra: Mapping[str, Any], namespace: str | None, start: launcher.Start) -> Topics:
+    restarts = Restarts(extra['restarts'], extra['restarts_within'])
+    return Topics(namespace, extra['peer_deadline'], start, restarts=restarts)
 
 
 def default_out(settings: Settings, stamp: str) -> str:
@@ -186,6 +204,7 @@ def train(
     try:
         if begun is not None:
             notes = resume.begin(folder, begun, settings)
+            run_folder.forget_reports(folder)
         else:
             run_folder.write_settings(folder, settings)
             where = namespace or launcher.namespace_of(run_id)
@@ -316,6 +335,8 @@ def _over_topics(
                     interrupts,
                     silence,
                     lambda node: why_it_gave_up(node, folder),
+                    restarts=topics.restarts,
+                    over=lambda node: is_over(node, folder),
                 )
                 watcher.poll(0.0)  # the last messages of the last node
         except LaunchError as error:
@@ -324,7 +345,9 @@ def _over_topics(
     for node in processes.nodes:
         key = run_folder.report_path(folder, node.role, node.name).stem
         known = reports.get(key) or NodeReport(role=node.role, name=node.name)
-        reports[key] = known.model_copy(update={'exit_code': node.code})
+        reports[key] = known.model_copy(
+            update={'exit_code': node.code, 'restarts': topics.restarts.counts[node.name]}
+        )
     summary.end()
     interrupted = bool(interrupts.count)
     if (folder / run_folder.BAG).exists():  # else no recorder started, and the failure names it

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import tyro
 
 from codetr_ros.cli import film
-from codetr_ros.processes import middleware
+from codetr_ros.processes import middleware, restarts
 
 PEER_DEADLINE = 60.0
 """Seconds that nodes wait for each other unless the user gives others."""
@@ -42,6 +42,25 @@ FLAGS: Sequence[tuple[str, Any, Any]] = [
             ),
         ],
         PEER_DEADLINE,
+    ),
+    (
+        'restarts',
+        Annotated[
+            int,
+            tyro.conf.arg(
+                metavar='N',
+                help='how often a node that was killed is started again; 0: the run ends with it',
+            ),
+        ],
+        restarts.MOST,
+    ),
+    (
+        'restarts_within',
+        Annotated[
+            float,
+            tyro.conf.arg(metavar='S', help='seconds in which it is started again so often'),
+        ],
+        restarts.WITHIN,
     ),
     (
         'in_process',
@@ -103,4 +122,6 @@ def wrong(extra: Mapping[str, Any]) -> str | None:
         return '--namespace is for nodes, and --in-process starts none: leave out one of them'
     if namespace is not None and (reason := middleware.wrong_namespace(namespace)):
         return reason
-    return middleware.wrong_seconds('--peer-deadline', extra['peer_deadline'])
+    return middleware.wrong_seconds('--peer-deadline', extra['peer_deadline']) or restarts.wrong(
+        extra['restarts'], extra['restarts_within']
+    )

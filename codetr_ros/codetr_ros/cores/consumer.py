@@ -64,6 +64,7 @@ class Consumer(Part, ABC):
         self._memory: Trajectories | None = None
         self._phase = 0  # the next to be learnt from
         self._saved = -1
+        self._committed = -1  # phases up to this one are known to be committed
         self._from: Checkpoint | None = None  # where to go on
         self._last_metrics: dict[str, float] = {}  # as published after the last phase
         self._counters: Counter[str] = Counter()
@@ -73,7 +74,14 @@ class Consumer(Part, ABC):
     @property
     def missing(self) -> int | None:
         """A committed phase that is incomplete; None if there is none."""
-        return self._intake.missing
+        due = self._intake.due
+        return due if due <= self._committed else self._intake.missing
+
+    def catch_up(self, newest: int) -> None:
+        """Note that phases up to `newest` are committed, whether their commits have come or not:
+        those that have not been taken in are then missing.
+        """
+        self._committed = newest
 
     @property
     def doubt(self) -> str:
@@ -102,8 +110,8 @@ class Consumer(Part, ABC):
 
     @property
     def due(self) -> int | None:
-        """The next phase to be learnt from."""
-        return self._phase
+        """The next phase to be taken in."""
+        return self._intake.due
 
     def resume(self, newest: int | None = None) -> int:
         """Go on from the newest sound checkpoint of this run. Call it before `work`, if at all.

@@ -33,6 +33,10 @@ class Core(Protocol[Given_co]):
         """The next phase to be finished here; None if there are none here."""
 
     @property
+    def unlabelled(self) -> int | None:
+        """A phase whose labels are awaited; None if there is none."""
+
+    @property
     def duplicated(self) -> 'Counter[str]':
         """Counts of records that arrived again and were dropped, by topic."""
 
@@ -86,6 +90,11 @@ class Part:
 
     def fetched(self, phase: int) -> None:
         """Do nothing: no phase is missing."""
+
+    @property
+    def unlabelled(self) -> int | None:
+        """A phase whose labels are awaited; None if there is none."""
+        return None
 
     def waiting_for(self) -> str:
         """What the next slice waits for, for people."""

@@ -93,6 +93,11 @@ class Intake:
         """A committed phase that is incomplete or differs from its commit; None if none is."""
         return self.commits.lacking if self._incomplete is None else self._incomplete
 
+    @property
+    def due(self) -> int:
+        """The next phase to be taken in."""
+        return self.commits.next
+
     def waiting_for(self) -> str:
         """What the next phase still lacks, for people."""
         if not self.tasks.known:

@@ -62,6 +62,11 @@ class Learner(Consumer):
         self._applied = 0  # labels of phases before this one have been taken in
         self._learner: PolicyLearner | None = None
 
+    @property
+    def unlabelled(self) -> int | None:
+        """A phase whose labels are awaited; None if there is none."""
+        return self._phase if self._awaits_labels else None
+
     def receive(self, record: Record) -> None:
         """Hold a record until its phase's turn.
 

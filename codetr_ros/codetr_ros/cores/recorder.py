@@ -248,6 +248,19 @@ class Recorder(Part):
                     'the bag is damaged. `codetr bag verify` lists what is wrong'
                 )
 
+    def comes_early(self, record: Record) -> bool:
+        """Whether records of the same source or scorer that must come before it have not come,
+        though it is no further ahead than what is permitted.
+        """
+        if isinstance(record, Transitions):
+            due = self._transitions[record.source]
+        elif isinstance(record, CompositeReward) and not self._settings.scored_elsewhere:
+            due = self._scores[record.scorer]
+        else:
+            return False
+        most = (self._settings.ahead + 1) * self._settings.phase_steps
+        return due < record.sequence < due + most
+
     def _next(self, record: Any, due: 'Counter[str]', name: str) -> bool:
         if record.sequence > due[name]:
             raise RecordError(

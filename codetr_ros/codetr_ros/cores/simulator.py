@@ -1,5 +1,6 @@
 """A simulator: rolls out the steps that each policy permits, and publishes what happened."""
 
+import hashlib
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -9,6 +10,7 @@ from codetr_ros.cores.core import Part
 from codetr_ros.cores.left_out import LeftOutError, is_left_out
 from codetr_ros.policy.acting import ActingPolicy
 from codetr_ros.records import (
+    TOPICS,
     Commit,
     Metrics,
     Policy,
@@ -62,6 +64,8 @@ class Simulator(Part):
         self._phase = 0  # the next to be run
         self._resumed = False
         self._ran = False  # whether it has taken steps since it began or went on
+        self._first = 0  # that is run in this process: those before it were run in another
+        self._known: dict[int, tuple[int, bytes, bytes]] = {}  # what was permitted, by phase
         self._counters: Counter[str] = Counter()
         self._closed = False
 
@@ -91,7 +95,7 @@ class Simulator(Part):
         Raises:
             TaskError: an environment is at fault.
         """
-        self._phase = phase
+        self._phase = self._first = phase
         self._resumed = True
         self._counters['phases'] = phase
         for source in self._sources:
@@ -109,6 +113,9 @@ class Simulator(Part):
         ends = not policy.steps.any()
         if ends and self.finished:
             return  # with overlap two policies permit nothing; the second serves the evaluator
+        if policy.phase < self._first or self._known.get(policy.phase) == _content(policy):
+            self.duplicated[TOPICS[Policy]] += 1  # of a learner that was started again
+            return
         if policy.phase < self._phase or policy.phase in self._waiting:
             done = 'run' if policy.phase < self._phase else 'received'
             raise RecordError(
@@ -125,6 +132,7 @@ class Simulator(Part):
         environment = self._sources[0].environment
         acting = None if ends else acting_policy(policy, environment, self._settings)
         self._waiting[policy.phase] = policy, acting
+        self._known[policy.phase] = _content(policy)
 
     @property
     def due(self) -> int:
@@ -219,6 +227,11 @@ class Simulator(Part):
         for source in self._sources:
             counters.update(source.counters)
         return CoreReport(lost={}, duplicated={}, counters=dict(counters))
+
+
+def _content(policy: Policy) -> tuple[int, bytes, bytes]:
+    """What a policy permits, and a digest of its weights."""
+    return policy.version, policy.steps.tobytes(), hashlib.sha256(policy.weights).digest()
 
 
 def _transitions(records: list[Record]) -> Transitions:

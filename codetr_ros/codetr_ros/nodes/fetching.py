@@ -11,15 +11,16 @@ class Fetching:
         self._missing: int | None = None
         self._due = 0.0
 
-    def due(self, missing: int | None, now: float) -> bool:
+    def due(self, missing: int | None, now: float, at_once: bool = False) -> bool:
         """Whether to ask for a phase now.
 
         Args:
             missing: the committed phase that is incomplete; None if there is none.
             now: monotonic time [s].
+            at_once: nothing of it is under way any more.
         """
         if missing != self._missing:
-            self._missing, self._due = missing, now + AFTER
+            self._missing, self._due = missing, now + (0.0 if at_once else AFTER)
         if missing is None or now < self._due:
             return False
         self._due = now + AGAIN

@@ -12,6 +12,11 @@ class LastPhases:
         self._committed: dict[int, list[tuple[type, bytes]]] = {}
         self._phases = phases
 
+    @property
+    def newest(self) -> int | None:
+        """The last committed phase; None before the first."""
+        return max(self._committed, default=None)
+
     def hold(self, record: Record, raw: bytes) -> None:
         """Keep the bytes of a record that the core has taken, until a commit names it.
 

@@ -119,6 +119,27 @@ class Peers:
                     died.append(f'{who} died')
         return died or given_up
 
+    def restarted(self, presence: Presence) -> bool:
+        """Whether an instance of a node has taken the place of another one."""
+        return any(
+            peer.presence.node == presence.node
+            and peer.presence.instance_id != presence.instance_id
+            for peer in self.by_instance.values()
+        )
+
+    def waits_for_nobody(self, role: str, now: float, deadline: float) -> bool:
+        """Whether all nodes of a role have finished, or been silent beyond a deadline.
+
+        Args:
+            role: the role.
+            now: monotonic time [s].
+            deadline: seconds; 0: for ever.
+        """
+        return all(
+            peer.presence.finished or 0 < deadline < now - peer.received_at
+            for peer in self.alive(role)
+        )
+
     def anybody_left(self) -> bool:
         """Whether any peer has not finished."""
         return any(not peer.presence.finished for peer in self.newest())
@@ -142,6 +163,24 @@ class Ledger:
         self._patience = patience
         self._published: deque[tuple[float, Counter[str]]] = deque()  # times, counts by then
         self._due: Counter[str] = Counter()
+        self._forgiven: Counter[str] = Counter()
+
+    def forgive(self, published: 'Counter[str]', received: 'Counter[str]') -> None:
+        """Begin to count anew, by topic: what is under way now may never arrive, since who sent it
+        was killed and sends it again, or who counts was. It does not count as lost.
+        """
+        self._published.clear()
+        self._due.clear()
+        self._forgiven = Counter(published)
+        self._forgiven.subtract(received)
+
+    def owed(self, published: 'Counter[str]', received: 'Counter[str]') -> dict[str, int]:
+        """Counts of records that were published and have not arrived, whenever that was."""
+        return {
+            topic: lacking
+            for topic, n in sorted(published.items())
+            if (lacking := n - received[topic] - max(0, self._forgiven[topic])) > 0
+        }
 
     def note(self, published: 'Counter[str]', now: float) -> None:
         """Note the counts of the records that peers have published by now, by topic."""
@@ -152,8 +191,4 @@ class Ledger:
         """Counts of the lost records, for topics that lost any."""
         while self._published and self._published[0][0] <= now - self._patience:
             self._due = self._published.popleft()[1]
-        return {
-            topic: n - received[topic]
-            for topic, n in sorted(self._due.items())
-            if n > received[topic]
-        }
+        return self.owed(self._due, received)

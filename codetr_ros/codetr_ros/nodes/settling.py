@@ -53,11 +53,13 @@ class Settling:
         Raises:
             NodeError: a node has ended too early, or records never arrived.
         """
-        newest = [
-            p for p in self._peers.newest() if not (p.failed and now - p.received_at > GRACE)
+        grace = max(GRACE, self._deadline)  # one that was killed may be started again meanwhile
+        there = [
+            p
+            for p in self._peers.newest()
+            if not p.presence.finished and not (p.failed and now - p.received_at > grace)
         ]
-        present = [p.presence for p in newest if not p.presence.finished]
-        running = [f'{p.role} {p.node}' for p in present]
+        running = [f'{p.presence.role} {p.presence.node}' for p in there]
         if not running and not missing:
             if failed := self._peers.failed():
                 raise NodeError(
@@ -71,7 +73,7 @@ class Settling:
             f'and for {", ".join(lacking) or "nothing"}'
         )
         # a node that still publishes its presence may work as long as it needs
-        newest_at = max((p.received_at for p in self._peers.by_instance.values()), default=0.0)
+        newest_at = max((p.received_at for p in there), default=0.0)
         if self._deadline and min(seconds, now - newest_at) > self._deadline:
             raise NodeError(
                 f'{self._who} gave up after {self._deadline:g} s: {doing}. The bag lacks that'

@@ -19,6 +19,7 @@ from codetr_ros.records import (
     RunSpec,
     StepRewards,
     Transitions,
+    describe,
 )
 from codetr_ros.records.bounds import check_bounds
 from codetr_ros.records.checks import check_phase
@@ -27,6 +28,8 @@ from codetr_ros.records.shown import LONGEST_LINE, shown, worth_a_line
 PHASED = (Policy, Transitions, Commit, StepRewards)
 """Kinds of records of a phase that must have been permitted."""
 LATE_COMMITS = 16
+MOST_HELD = 4096
+"""Records that are held back while a node joins."""
 
 
 def arrived(kind: type, data: bytes) -> Record:
@@ -89,6 +92,28 @@ class Traffic:
         self.recovered: Counter[str] = Counter()
         self.ledger = Ledger()
         self.lost_for_good: dict[str, int] | None = None
+        self._held: list[Record] | None = None
+
+    def hold(self) -> None:
+        """Hold back records of phases until it is certain which phase is the next one here."""
+        self._held = []
+
+    def release(self) -> None:
+        """Hand over what was held back, and what comes from now on."""
+        held, self._held = self._held or [], None
+        for record in held:
+            self.receive(record)
+
+    def _holds_back(self, record: Record) -> bool:
+        if self._held is None or not isinstance(record, PHASED):
+            return False
+        if len(self._held) >= MOST_HELD:
+            raise RecordError(
+                f'{describe(record)} came before this node had joined, when {MOST_HELD} others '
+                'waited for that already: what it lacks is fetched again'
+            )
+        self._held.append(record)
+        return True
 
     def decode(self, kind: type, data: bytes) -> Record | None:
         """The record in a message that arrived; None if it must be refused, which is counted."""
@@ -110,6 +135,8 @@ class Traffic:
         taker = self.core if taker is None else taker
         before = taker.duplicated.total()
         try:
+            if self._holds_back(record):
+                return True
             self._check_phase(record)
             taker.receive(record)
         except RecordError as error:

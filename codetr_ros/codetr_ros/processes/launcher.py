@@ -194,9 +194,18 @@ Start = Callable[[Sequence[str], Mapping[str, str], BinaryIO], Process]
 
 
 def start_program(
-    arguments: Sequence[str], environment: Mapping[str, str], log: BinaryIO
+    arguments: Sequence[str],
+    environment: Mapping[str, str],
+    log: BinaryIO,
+    keep_open: Sequence[int] = (),
 ) -> Process:
     """Start a program that ends when we do, in a session of its own (Ctrl-C reaches only us).
+
+    Args:
+        arguments: its path, and its arguments.
+        environment: its environment.
+        log: takes what it prints.
+        keep_open: descriptors of files that stay open as long as it runs.
 
     Raises:
         OSError: it cannot be started.
@@ -208,6 +217,7 @@ def start_program(
         stderr=subprocess.STDOUT,
         env=dict(environment),
         start_new_session=True,
+        pass_fds=keep_open,
         # One system call, looked up before: safe beside ROS's threads.
         preexec_fn=end_with_parent(),  # noqa: PLW1509
     )
@@ -222,6 +232,7 @@ class Node:
     log: Path
     asked: bool = False  # we sent it a signal to end
     killed: bool = False  # we killed it, because it did not end when asked
+    excused: bool = False  # it died when it had done everything
 
     @property
     def name(self) -> str:
@@ -241,7 +252,7 @@ class Node:
     @property
     def unasked_failure(self) -> bool:
         """Whether it ended with an error without being asked to end."""
-        return self.code not in (None, 0) and not self.asked
+        return self.code not in (None, 0) and not self.asked and not self.excused
 
     def how_it_ended(self) -> str:
         """How it ended, for people."""
@@ -289,24 +300,37 @@ class Processes:
     stop_deadline: float = STOP_DEADLINE
     start_program: Start = start_program
     nodes: list[Node] = field(default_factory=list)
+    _environment: dict[str, str] = field(default_factory=dict)
 
     def start(self, commands: Iterable[Command], logs: Path, env: Mapping[str, str]) -> None:
-        """Start processes, each with a log.
+        """Start processes, each with a log, to which it appends.
 
         Raises:
             LaunchError: one cannot be started; those started before it still run (see `stop`).
         """
+        self._environment = dict(env)
         for command in commands:
             log = logs / f'{command.name}.log'
-            with log.open('wb') as file:
-                file.write(f'$ {shlex.join(command.arguments)}\n'.encode())
-                file.flush()
-                try:
-                    process = self.start_program(command.arguments, env, file)
-                except OSError as error:
-                    what = f'{command.name} ({command.arguments[0]})'
-                    raise LaunchError(f'{what} cannot be started: {error.strerror}') from error
-            self.nodes.append(Node(command, process, log))
+            self.nodes.append(Node(command, self._begin(command, log), log))
+
+    def start_again(self, node: Node) -> None:
+        """Start a process again that has ended; its log goes on.
+
+        Raises:
+            LaunchError: it cannot be started.
+        """
+        assert node.code is not None
+        node.process = self._begin(node.command, node.log)
+
+    def _begin(self, command: Command, log: Path) -> Process:
+        with log.open('ab') as file:
+            file.write(f'$ {shlex.join(command.arguments)}\n'.encode())
+            file.flush()
+            try:
+                return self.start_program(command.arguments, self._environment, file)
+            except OSError as error:
+                what = f'{command.name} ({command.arguments[0]})'
+                raise LaunchError(f'{what} cannot be started: {error.strerror}') from error
 
     def running(self) -> list[Node]:
         """The processes that have not ended."""

@@ -8,6 +8,7 @@ from types import FrameType, TracebackType
 from typing import Any
 
 from codetr_ros.processes.launcher import Node, Processes
+from codetr_ros.processes.restarts import Restarts
 from codetr_ros.records import Presence, Record
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import reports
@@ -82,8 +83,11 @@ def supervise(
     silence: Silence,
     gave_up: Callable[[Node], str | None] = lambda node: None,
     deadline: float = SILENCE_DEADLINE,
+    restarts: Restarts | None = None,
+    over: Callable[[Node], bool] = lambda node: False,
 ) -> str | None:
-    """Watch until every process has ended; end them all if one fails or the user asks.
+    """Watch until every process has ended; start those again that were killed, and end all of them
+    if one fails or the user asks.
 
     Args:
         processes: the processes of the run, started.
@@ -94,10 +98,13 @@ def supervise(
             None.
         deadline: seconds of silence after which nodes that did not end with the others are
             ended.
+        restarts: how often a node that was killed is started again; None: never.
+        over: for a node that was killed: whether it had done all that the run needs of it.
 
     Returns:
         Why the run failed; None if it finished or was interrupted.
     """
+    restarts = restarts or Restarts(most=0)
     ended = 0
     while True:
         poll()
@@ -105,9 +112,12 @@ def supervise(
             processes.log('stopping: nodes end their slice and save (Ctrl-C again to hurry)')
             processes.stop()
             return _after_stop(processes)
+        if _start_again(processes, restarts, over):
+            silence.broken()
         running = processes.running()
         if (failed := processes.failed()) is not None:
-            return _stop_all(processes, failed.how_it_ended())
+            died = failed.how_it_ended() + restarts.exhausted(failed.name, failed.code)
+            return _stop_all(processes, died)
         for node in processes.nodes:
             if node.code == 0 and (reason := gave_up(node)) is not None:
                 return _stop_all(processes, reason)
@@ -120,6 +130,22 @@ def supervise(
             names = ', '.join(node.name for node in running)
             text = f'{names} did not end within {deadline:g} s after the rest of the run'
             return _stop_all(processes, text)
+
+
+def _start_again(processes: Processes, restarts: Restarts, over: Callable[[Node], bool]) -> bool:
+    """Start the nodes again that were killed and may be; whether there were any."""
+    some = False
+    for node in processes.nodes:
+        if not node.unasked_failure:
+            continue
+        if over(node):
+            node.excused = True
+        elif restarts.permit(node.name, node.code):
+            times = restarts.counts[node.name]
+            processes.log(f'{node.how_it_ended()}: starting it again (number {times})')
+            processes.start_again(node)
+            some = True
+    return some
 
 
 def _stop_all(processes: Processes, reason: str) -> str:
@@ -136,6 +162,15 @@ def _after_stop(processes: Processes) -> str | None:
     clean = (0, -signal.SIGINT)
     odd = [node.how_it_ended() for node in processes.nodes if node.code not in clean]
     return '; '.join(odd) or None
+
+
+def is_over(node: Node, folder: Path) -> bool:
+    """Whether a node that was killed had done all that the run needs of it, by the reports: it had
+    finished, and the recorder, which others may have needed it for, had too.
+    """
+    return reports.has_finished(folder, node.role, node.name) and reports.has_finished(
+        folder, 'record'
+    )
 
 
 def why_it_gave_up(node: Node, folder: Path) -> str | None:

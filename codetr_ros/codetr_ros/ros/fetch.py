@@ -1,20 +1,44 @@
-"""Fetches a committed phase again from the recorder, for a node that lacks some of it."""
+"""Asks other nodes for phases again: the recorder for a committed one, any other for what it has
+published.
+"""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from codetr_msgs.srv import FetchPhase
 
-from codetr_ros.nodes.fetching import Fetching
-from codetr_ros.nodes.traffic import Traffic
+from codetr_ros.nodes.fetching import AGAIN
 from codetr_ros.records import RecordError
 from codetr_ros.records.fields import RECORD_TYPES
 from codetr_ros.records.shown import shown
 from codetr_ros.ros.link import Link
 
 SERVICE = 'fetch_phase'
+"""That of the recorder."""
+NEWEST: int = FetchPhase.Request.NEWEST
+
+
+def service_of(node: str) -> str:
+    """The service of a node other than the recorder, by the node's full name."""
+    return f'{node}/{SERVICE}'
+
+
+@dataclass
+class Answer:
+    """What came of a question.
+
+    Attributes:
+        phase: which phase was sent; None if none was.
+        reason: why nothing was sent; empty if something was.
+        messages: kind and bytes of each.
+    """
+
+    phase: int | None
+    reason: str = ''
+    messages: list[tuple[type, bytes]] = field(default_factory=list)
 
 
 def unpack(response: Any) -> Iterator[tuple[type, bytes]]:
@@ -27,69 +51,104 @@ def unpack(response: Any) -> Iterator[tuple[type, bytes]]:
     if len(lengths) != len(response.types) or sum(lengths) != len(response.cdr):
         raise RecordError(
             f'{SERVICE}: {len(response.types)} types, {len(lengths)} lengths of {sum(lengths)} '
-            f'bytes and {len(response.cdr)} bytes disagree: update the recorder'
+            f'bytes and {len(response.cdr)} bytes disagree: update the node that sends'
         )
     data = bytes(response.cdr)
     ends = np.cumsum(lengths, dtype=np.int64)
     for kind, length, end in zip(response.types, lengths, ends.tolist(), strict=True):
         if kind not in RECORD_TYPES:
             raise RecordError(
-                f'{SERVICE}: {shown(repr(kind))} is not a type of record: update the recorder'
+                f'{SERVICE}: {shown(repr(kind))} is not a type of record: update the node that '
+                'sends'
             )
         yield RECORD_TYPES[kind], data[end - length : end]
 
 
-class Fetcher:
-    """Asks the recorder for a phase that stays incomplete.
+class Asker:
+    """Asks one node for phases, one after the other, each part by part.
 
     Args:
-        link: the node's connection.
+        link: the connection of who asks.
+        service: the service that is asked.
         run_id: the run.
-        traffic: takes each message that arrives.
     """
 
-    def __init__(self, link: Link, run_id: str, traffic: Traffic) -> None:
+    def __init__(self, link: Link, service: str, run_id: str) -> None:
         self._link = link
         self._run_id = run_id
-        self._traffic = traffic
-        self._client = link.node.create_client(FetchPhase, SERVICE)
-        self._fetching = Fetching()
+        self._client = link.node.create_client(FetchPhase, service)
+        self._question = 0  # the number of the present one
+        self._asked_at: float | None = None  # when the last part was asked for
 
-    def check(self, missing: int | None) -> None:
-        """Ask for a phase that has been incomplete for a while.
+    @property
+    def service(self) -> str:
+        """The full name of the service."""
+        return str(self._client.srv_name)
+
+    @property
+    def ready(self) -> bool:
+        """Whether the service is there."""
+        return bool(self._client.service_is_ready())
+
+    @property
+    def busy(self) -> bool:
+        """Whether an answer is still to be expected: a node that has died sends none."""
+        return self._asked_at is not None and time.monotonic() < self._asked_at + AGAIN
+
+    def ask(
+        self, phase: int, answered: Callable[[Answer], None], kinds: Collection[str] = ()
+    ) -> None:
+        """Ask for a phase; an earlier question that has no answer yet is forgotten.
 
         Args:
-            missing: the committed phase that is incomplete, None if there is none.
+            phase: which one, or `NEWEST`.
+            answered: called by the main loop, once all parts have come or nothing is sent.
+            kinds: types of the messages that are wanted; empty: all.
         """
-        if not self._fetching.due(missing, time.monotonic()):
-            return
-        log = self._link.node.get_logger()
-        if not self._client.service_is_ready():
-            log.warning(
-                f'phase {missing} is incomplete, and no recorder offers {self._client.srv_name!r}'
-            )
-            return
-        log.warning(f'phase {missing} is incomplete: asking the recorder for it')
+        self._question += 1
+        self._ask(_Question(self._question, phase, tuple(kinds), answered))
+
+    def _ask(self, question: '_Question') -> None:
+        self._asked_at = time.monotonic()
         request = FetchPhase.Request(
-            run_id=self._run_id, phase=missing, requester=self._link.full_name
+            run_id=self._run_id,
+            phase=question.phase,
+            requester=self._link.full_name,
+            kinds=list(question.kinds),
+            part=question.part,
         )
         future = self._client.call_async(request)
-        future.add_done_callback(lambda reply: self._link.store(self._arrived, missing, reply))
+        future.add_done_callback(lambda done: self._link.store(self._arrived, question, done))
 
-    def _arrived(self, phase: int, reply: Any) -> None:
-        response = reply.result()
-        log = self._link.node.get_logger()
-        if not response.found:
-            reason = shown(response.reason)
-            log.error(f'the recorder does not send phase {phase} again: {reason}')
+    def _arrived(self, question: '_Question', done: Any) -> None:
+        if question.number != self._question or self._asked_at is None:
             return
-        came = 0
+        response = done.result()
+        if not response.found:
+            self._asked_at = None
+            question.answered(Answer(None, shown(response.reason) or 'no reason is given'))
+            return
         try:
-            for kind, data in unpack(response):
-                came += 1
-                self._traffic.take_again(kind, data)
+            question.messages += unpack(response)
         except RecordError as error:
-            self._traffic.refuse(SERVICE, error)
-        else:
-            self._traffic.core.fetched(phase)
-        log.info(f'phase {phase}: {came} messages came again')
+            self._asked_at = None
+            question.answered(Answer(None, str(error)))
+            return
+        question.part += 1
+        if question.part < response.parts and question.messages:
+            question.phase = response.phase
+            self._ask(question)
+            return
+        self._asked_at = None
+        phase = None if response.phase == NEWEST else response.phase
+        question.answered(Answer(phase, '', question.messages))
+
+
+@dataclass
+class _Question:
+    number: int
+    phase: int
+    kinds: tuple[str, ...]
+    answered: Callable[[Answer], None]
+    part: int = 0
+    messages: list[tuple[type, bytes]] = field(default_factory=list)

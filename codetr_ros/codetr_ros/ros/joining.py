@@ -20,6 +20,7 @@ from codetr_ros.ros.gathering import IDLE, wait_for
 from codetr_ros.ros.membership import Membership
 from codetr_ros.ros.signals import Stopped
 from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs import origin
 from codetr_ros.simulation import tasks
 from codetr_ros.system.files import make_folder
 
@@ -81,11 +82,11 @@ def refuse_idle_reward(who: str, role: str, settings: Settings) -> None:
         )
 
 
-def refuse_used_folder(who: str, folder: Path, settings: Settings) -> None:
+def refuse_used_folder(who: str, folder: Path, settings: Settings, run_id: str) -> None:
     """Refuse a folder that holds another run.
 
     Raises:
-        NodeError: it holds other settings, or checkpoints.
+        NodeError: it holds other settings, or another run's checkpoints.
         SettingsError: its settings cannot be read.
     """
     remedy = 'give the parameter folder another one, or remove it'
@@ -96,9 +97,14 @@ def refuse_used_folder(who: str, folder: Path, settings: Settings) -> None:
             f'settings: {remedy}'
         )
     checkpoints = folder / run_folder.CHECKPOINTS
-    if checkpoints.is_dir() and (names := sorted(entry.name for entry in checkpoints.iterdir())):
+    if not checkpoints.is_dir() or not (names := sorted(p.name for p in checkpoints.iterdir())):
+        return
+    begun = (folder / run_folder.ORIGIN).is_file()
+    there = origin.read(folder).run_id if begun else None
+    if there is None or there != run_id:
+        known = '' if there is None else f' (run_id = {there!r}, with which it would go on)'
         raise NodeError(
-            f'{who}: folder {folder} holds another run, whose checkpoints are in '
+            f'{who}: folder {folder} holds another run{known}, whose checkpoints are in '
             f'{checkpoints} ({", ".join(names[:3])}): {remedy}'
         )
 
@@ -117,7 +123,7 @@ def own_run(member: Membership) -> tuple[RunSpec, Settings]:
     if not settings.on_robot:  # the robot announces its horizon itself
         tasks.check(settings, tasks.find(settings.task))
     if member.folder:
-        refuse_used_folder(who, member.folder, settings)
+        refuse_used_folder(who, member.folder, settings, member.values['run_id'])
     made = f'{time.strftime("%Y%m%d-%H%M%S")}-{secrets.token_hex(2)}'
     return settings.run_spec(member.values['run_id'] or made), settings
 
@@ -162,9 +168,13 @@ def join(
     if 'torch' in sys.modules:  # the recorder has no torch and needs none
         sys.modules['torch'].set_num_threads(settings.thread_count)
     folder = member.folder
-    if announce is not None and folder and not (folder / run_folder.CONFIG).exists():
+    if announce is not None and folder:
         make_folder(folder)
-        run_folder.write_settings(folder, settings)
+        if not (folder / run_folder.CONFIG).exists():
+            run_folder.write_settings(folder, settings)
+        if not (folder / run_folder.ORIGIN).exists():
+            namespace = link.full_name.rpartition('/')[0] or '/'
+            origin.write(folder, origin.origin(settings, run.run_id, namespace, False, True, None))
     checkpoints = folder / run_folder.CHECKPOINTS if folder else None
     core = make_core(run, settings, link.name, checkpoints, **member.core_values)
     member.serve(core, settings)

@@ -3,6 +3,7 @@
 import hashlib
 import secrets
 import time
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,26 +13,35 @@ import numpy as np
 from codetr_ros.config import Settings, SettingsError, from_canonical
 from codetr_ros.cores.core import Core
 from codetr_ros.nodes.errors import NodeError
+from codetr_ros.nodes.outbox import Outbox
 from codetr_ros.nodes.patience import Limit, Patience
 from codetr_ros.nodes.peers import Peers
 from codetr_ros.nodes.traffic import Traffic
 from codetr_ros.records import (
     PROTOCOL_VERSION,
+    TOPICS,
     Commit,
+    Metrics,
     Presence,
+    Record,
     RecordError,
     RunSpec,
+    StepRewards,
     describe,
 )
 from codetr_ros.records.bounds import LONGEST_DOING
 from codetr_ros.records.roles import published_by
 from codetr_ros.ros import given, link, parameters
-from codetr_ros.ros.fetch import Fetcher
+from codetr_ros.ros.catching_up import OF_PHASES, Fetcher
 from codetr_ros.ros.link import Link
+from codetr_ros.ros.resend import serve_outbox
 from codetr_ros.ros.signals import Stop
 from codetr_ros.system.files import FileError, check_makeable
 from codetr_ros.system.liveness import own_name
 
+KEPT_PHASES = 6
+"""Phases, beside those that may be under way, of which a node keeps what it has published: as far
+as a learner may go back whose newest checkpoints are damaged."""
 PRESENCE_EVERY = 1.0  # [s] between two messages of presence and diagnostics
 
 
@@ -52,6 +62,7 @@ class Membership:
         announcement: the bytes that announced the run; none in the node that made it.
         begun: whether all peers have been present; from then on, a conflict with another node or
             run is logged and ends no node.
+        over: whether it has done everything, and publishes nothing more but its presence.
         doing: what the node does now, for people.
         waits_since: monotonic time [s] since which it has waited for that; None while it works.
         deadline_is: what the user sets `deadline` with, for errors.
@@ -86,12 +97,14 @@ class Membership:
         self.run: RunSpec | None = None
         self.announcement = b''
         self.begun = False
+        self.over = False
         self.doing = 'starting'
         self.deadline_is, self.again = Limit.setting, Limit.again
         self.waits_since: float | None = None
         self._instance = f'{secrets.token_hex(8)} {own_name()}'.rstrip()
         self._serves = False  # the core is made from the run's settings
         self._fetcher: Fetcher | None = None
+        self._outbox: Outbox | None = None
         self._logged: set[str] = set()  # errors that are logged once
         self._presence_at = 0.0
 
@@ -168,7 +181,42 @@ class Membership:
         if self.run is not None:
             self.traffic.run_id = self.run.run_id
         if self.run is not None and Commit in core.subscribes:
-            self._fetcher = Fetcher(self.link, self.run.run_id, self.traffic)
+            take = self.traffic.take_again
+            self._fetcher = Fetcher(self.link, self.run.run_id, self.peers, take)
+
+    def keep_published(self, settings: Settings) -> None:
+        """Keep what the node publishes from now on for a while, and send it again on request."""
+        assert self.run is not None
+        phases = None if self.role == 'evaluate' else settings.ahead + KEPT_PHASES
+        self._outbox = Outbox(settings.phase_steps, phases)
+        serve_outbox(self.link, self.run.run_id, self._outbox)
+
+    def publish(self, record: Record) -> None:
+        """Publish a record of the node's core."""
+        if self._outbox is not None:
+            self._outbox.keep(record)
+        self.link.publish(record)
+
+    def catch_up(self, newest: int) -> None:
+        """Fetch all phases up to a committed one that the core has not taken in."""
+        core: Any = self.traffic.core
+        core.catch_up(newest)
+        if self._fetcher is not None:
+            self._fetcher.behind = newest
+
+    def begin_counting_anew(self) -> None:
+        """Count as lost only what is published from now on and never arrives."""
+        traffic = self.traffic
+        traffic.ledger.forgive(self.all_published(), traffic.received + traffic.recovered)
+
+    def all_published(self) -> 'Counter[str]':
+        """Counts of the records that were published for this node to receive, by topic."""
+        published = self.peers.published()
+        if self.role == 'record':  # it reads what it publishes, but for its commits
+            published.update(
+                {t: n for t, n in self.link.published.items() if t == TOPICS[Metrics]}
+            )
+        return published
 
     def turn(self, wait: float = 0.0) -> None:
         """Give ROS its turn: take what arrived, and publish the presence when it is due.
@@ -180,7 +228,7 @@ class Membership:
         if time.monotonic() - self._presence_at >= PRESENCE_EVERY:
             self.publish_presence()
         if self._fetcher is not None and self.begun:
-            self._fetcher.check(self.traffic.core.missing)
+            self._fetcher.check(self.traffic.core)
         for other in self.company:
             other.turn()
 
@@ -196,10 +244,19 @@ class Membership:
                 self._note_peer(record)
             elif isinstance(record, RunSpec):
                 self._note_run(record, data)
-            else:
+            elif not self._fetched_later(record):
                 self.traffic.receive(record)
         except RecordError as error:
             self.traffic.refuse(kind, error)
+
+    def _fetched_later(self, record: Record) -> bool:
+        """Whether a record is of a phase that is fetched when those before it have been taken in:
+        the node has joined late, and could not hold all that comes meanwhile.
+        """
+        if self._fetcher is None or not isinstance(record, (*OF_PHASES, StepRewards)):
+            return False
+        missing = self.traffic.core.missing
+        return missing is not None and missing <= self._fetcher.behind
 
     # ---- runs and peers
 
@@ -211,6 +268,7 @@ class Membership:
                     f'run {spec.run_id!r} is announced again with other settings: stop the second '
                     'learner'
                 )
+            self.traffic.received['run'] += 1  # of a learner that was started again
             return
         if spec.protocol_version != PROTOCOL_VERSION:
             raise RecordError(
@@ -268,7 +326,9 @@ class Membership:
         news = self.peers.note(presence, now)
         if news:
             self.log.info(news)
-        self.traffic.ledger.note(self.peers.published(), now)
+            if self.peers.restarted(presence) and not presence.finished:
+                self.begin_counting_anew()  # what the one before has not sent is sent anew
+        self.traffic.ledger.note(self.all_published(), now)
 
     def _log_once(self, text: str) -> None:
         if text not in self._logged:
@@ -280,12 +340,9 @@ class Membership:
         for each in (self, *self.company):
             each._serves = False  # noqa: SLF001 - members of the same process
 
-    def publish_presence(self, finished: bool = False) -> None:
-        """Publish the node's presence, and the counts of its messages on /diagnostics.
-
-        Args:
-            finished: whether this is the last presence.
-        """
+    def publish_presence(self) -> None:
+        """Publish the node's presence, and the counts of its messages on /diagnostics."""
+        finished = self.over
         self._presence_at = time.monotonic()
         topics = tuple(t for t in published_by(self.role) if t in self.link.published)
         counters = self.traffic.counters()

@@ -73,7 +73,7 @@ class Node:
             if joined is not None:
                 wiring = self._wire(self.member, joined)
                 wiring.enter()
-                if self._gather(wiring):
+                if self._gather(wiring) and wiring.go_on():
                     self._work(wiring)
         except Exception as problem:  # noqa: BLE001 - report and last presence must go out
             self._sound = self._sound and errors.explains_itself(problem)
@@ -148,6 +148,7 @@ class Node:
             self.member.give_up()
         steps: list[Callable[[], None]] = [
             lambda: self._report(wiring, finished, error),
+            lambda: self._linger(finished),
             self._take_leave,
         ]
         if wiring is not None:
@@ -210,6 +211,26 @@ class Node:
         path = run_folder.report_path(member.folder, member.role, member.link.name)
         reports.write(path, report)
 
+    def _linger(self, finished: bool) -> None:
+        """Stay until the recorder has finished: it, or a node that is started again, may lack what
+        only this one can send.
+        """
+        member = self.member
+        if not finished or member.role == 'record':
+            return
+        for each in (member, *member.company):
+            each.over = True
+        member.publish_presence()
+        while not (member.stop or self._recorder_is_over()):
+            member.turn(IDLE)
+
+    def _recorder_is_over(self) -> bool:
+        """Whether the recorder has finished, by presence or report, or is gone for good."""
+        member = self.member
+        if member.peers.waits_for_nobody('record', time.monotonic(), member.deadline):
+            return True
+        return member.folder is not None and reports.has_finished(member.folder, 'record')
+
     def _take_leave(self) -> None:
         """Publish the last presence, and stay until the readers have everything or have finished
         too.
@@ -219,14 +240,18 @@ class Node:
         would make every run and every stop 3 s longer.
         """
         member, link = self.member, self.member.link
+        for each in (member, *member.company):
+            each.over = True
         for other in member.company:
-            other.publish_presence(finished=True)
+            other.publish_presence()
         if not member.values:
             return
         for _ in range(LAST_PRESENCES):
-            member.publish_presence(finished=True)
+            member.publish_presence()
         end = time.monotonic() + (STOPPED_DEADLINE if member.stop else ACK_DEADLINE)
-        while time.monotonic() < end and member.peers.anybody_left():
+        # everybody waits for the end of the recorder, though all have finished
+        awaited = member.role == 'record' and not member.stop
+        while time.monotonic() < end and (awaited or member.peers.anybody_left()):
             if not link.unacknowledged():
                 return
             link.handle(IDLE)

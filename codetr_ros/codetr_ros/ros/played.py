@@ -41,7 +41,8 @@ class PlayedWiring(Wiring):
 
     def open(self) -> None:
         """Subscribe to what the core wants. What else live nodes need read is read and ignored."""
-        super().open()
+        for kind in self.joined.core.subscribes:
+            self.member.link.subscribe(kind, self.take, self.joined.settings)
         settings = self.joined.settings
         for kind in _must_read(self.member.role, settings, self._live):
             if kind not in self.joined.core.subscribes:
@@ -52,6 +53,10 @@ class PlayedWiring(Wiring):
 
     def show(self, given: Sequence[Any], doing: str) -> None:
         """Log nothing: the player logs what it has played."""
+
+    def go_on(self) -> bool:
+        """Nothing is to be restored: the player begins with the first phase."""
+        return True
 
     def lacking(self) -> list[str]:
         """The live peers that are absent or not matched yet, in words."""

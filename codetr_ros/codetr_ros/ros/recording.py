@@ -1,45 +1,55 @@
 """The recorder's wiring: writes messages as they arrive, and commits phases.
 
-Every message that is admitted goes into the bag as received bytes; what is refused does not, or a
-bag could hold what nobody has learnt from. A commit goes into the bag after all records that it
-names, and out to the nodes only after the bag is flushed and synced. So nobody learns from what
-could be lost, and the bag names the records of every phase that anybody has learnt from. The last
-phases stay in memory too: the service `fetch_phase` sends one of them again.
+Every message that is admitted goes into the bag as received bytes, unless it came before; what is
+refused does not, or a bag could hold what nobody has learnt from. A commit goes into the bag after
+all records that it names, and out to the nodes only after the bag is flushed and synced. So nobody
+learns from what could be lost, and the bag names the records of every phase that anybody has
+learnt from.
+
+A recorder that is started again in the folder of its run goes on with the bag, and asks all other
+nodes for what it has missed. The service `fetch_phase` sends any committed phase again from the
+bag; without a bag, the last ones from memory.
 """
 
 import time
-from collections import Counter, deque
+from collections import deque
+from collections.abc import Collection
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from codetr_ros.bags.definitions import encode, stamp_of
 from codetr_ros.bags.topics import topics_of_run
-from codetr_ros.bags.writer import McapWriter
 from codetr_ros.cores.beside import Beside, Early
 from codetr_ros.cores.recorder import Recorder
-from codetr_ros.nodes.settling import Settling, still_missing
+from codetr_ros.nodes.kept_run import KeptRun
+from codetr_ros.nodes.settling import Settling
+from codetr_ros.nodes.traffic import arrived
 from codetr_ros.records import (
     TOPICS,
     Commit,
+    CompositeReward,
+    Preference,
     Presence,
     Record,
     RecordError,
     RunSpec,
     StepRewards,
     TaskSpec,
+    Transitions,
 )
-from codetr_ros.records.roles import published_by
+from codetr_ros.records.roles import ROLES, WRITERS
+from codetr_ros.ros.fetch import SERVICE
 from codetr_ros.ros.joining import Joined
 from codetr_ros.ros.membership import Membership
-from codetr_ros.ros.resend import Resender
+from codetr_ros.ros.resend import PhaseService
+from codetr_ros.ros.sweeping import Sweeper
 from codetr_ros.ros.wiring import Wiring
 from codetr_ros.runs import folder as run_folder
-from codetr_ros.runs.reports import BagReport, FlushTimes
+from codetr_ros.runs.reports import BagReport
 
+JUDGEMENTS = (CompositeReward, Preference)
 NOT_RECORDED = (Presence,)
 """Published once a second to show that a node is alive: no part of the run itself."""
-FLUSHES = 1000
-"""Number of the newest flushes, whose median the report gives."""
 
 
 class Recording(Wiring):
@@ -47,66 +57,145 @@ class Recording(Wiring):
 
     def __init__(self, member: Membership, joined: Joined) -> None:
         super().__init__(member, joined)
-        settings, node = joined.settings, member.link.node
-        kinds = [kind for kind in TOPICS if kind not in NOT_RECORDED]
-        self._full = {kind: node.resolve_topic_name(TOPICS[kind]) for kind in kinds}
+        settings = joined.settings
+        self._settling = Settling(member.link.full_name, member.peers, member.limit)
+        self._kinds = [kind for kind in TOPICS if kind not in NOT_RECORDED]
+        names = {k: member.link.node.resolve_topic_name(TOPICS[k]) for k in self._kinds}
+        self._bag = KeptRun(
+            self._bag_folder(),
+            dict(zip(self._kinds, topics_of_run(names, settings), strict=True)),
+            settings.ahead + 2,
+            settings.phase_steps,
+            round(member.values['bag_split_mb'] * 1e6),
+            round(member.values['bag_keep_free_mb'] * 1e6),
+        )
+        # the newest commits, as bytes: published again by a recorder that was started again
+        self._commits: deque[bytes] = deque(maxlen=settings.ahead + 1)
         core = cast(Recorder, joined.core)
         self._beside = Beside(joined.run, settings, lambda: core.phase)
-        self._early = Early(settings)
-        self._bag: McapWriter | None = None
-        self._recorded: Counter[str] = Counter()
-        self._settling = Settling(member.link.full_name, member.peers, member.limit)
-        self._flush_seconds = self._longest_flush = 0.0
-        self._flushes: deque[float] = deque(maxlen=FLUSHES)  # seconds, the newest
+        self._unannounced = Early(settings)
+        self._early: list[Record] = []  # came while something before them was lacking
+        self._sweeper = Sweeper(member.link, joined.run.run_id, self._knows, self._take_again)
 
     def open(self) -> None:
         """Open the bag, then subscribe to everything as raw bytes."""
-        settings, link = self.joined.settings, self.member.link
-        folder = self._bag_folder()
-        if folder:
-            self._bag = McapWriter(
-                folder,
-                topics_of_run(self._full, settings),
-                split_bytes=round(self.member.values['bag_split_mb'] * 1e6),
-                keep_free=round(self.member.values['bag_keep_free_mb'] * 1e6),
-            )
-            self.log.info(f'records to {folder}')
-        self._write(RunSpec, self.member.announcement)
-        for kind in self._full:
+        settings, link, bag = self.joined.settings, self.member.link, self._bag
+        run_id = self.joined.run.run_id
+        bag.open(run_id, self._restore)
+        if bag.gone_on:
+            self.log.info(f'goes on with {bag.folder}, behind phase {bag.newest}')
+        elif bag.folder:
+            self.log.info(f'records to {bag.folder}')
+        if not bag.recorded[TOPICS[RunSpec]]:
+            self._write(self.joined.run, self.member.announcement)
+        for kind in self._kinds:
             if kind not in (RunSpec, Commit):  # the first has arrived, the second is our own
                 link.subscribe(kind, self.take, settings)
-        self._last = Resender(link, self.joined.run.run_id, settings.ahead + 2)
+        PhaseService(link, SERVICE, run_id, bag.read, lambda: bag.newest)
+        for data in self._commits:  # and by the counts of its presence others know of them
+            link.send(TOPICS[Commit], data)
+
+    def _restore(self, record: Record, data: bytes) -> None:
+        """Take a record that the bag holds already."""
+        core: Any = self.joined.core
+        if isinstance(record, Commit):
+            self._commits.append(data)
+        if isinstance(record, TaskSpec):
+            self._unannounced.announced(record.source)
+        try:
+            core.restore(record)
+            if type(record) not in core.subscribes:
+                self._beside.receive(record)
+        except RecordError:
+            if isinstance(record, Commit):
+                raise
+            # else it was refused when it came, too
+
+    def go_on(self) -> bool:
+        """Ask all nodes for what was missed, if the bag was there before."""
+        if self._bag.gone_on:
+            self.member.begin_counting_anew()
+            self._sweeper.ask(self._nodes())
+        return True
+
+    def _nodes(self, roles: Collection[str] = ROLES) -> list[str]:
+        """Full names of the other nodes of these roles."""
+        return [
+            peer.presence.node
+            for role in roles
+            if role != self.member.role
+            for peer in self.member.peers.alive(role)
+        ]
 
     def _bag_folder(self) -> Path | None:
         if self.member.values['bag']:
             return Path(self.member.values['bag'])
         return self.joined.folder and self.joined.folder / run_folder.BAG
 
+    # ---- records
+
     def take(self, kind: type, raw: bytes) -> None:
         """Take the bytes of a message: what is admitted is written as it came."""
         record = self.member.traffic.decode(kind, raw)
-        if self._bag is not None and self._bag.closed:
-            return  # stopped, while others may still publish
-        if record is not None:
+        if record is not None and not self._bag.closed:  # else others may still publish
             self._take(record, raw)
 
-    def _take(self, record: Record, raw: bytes) -> None:
-        traffic = self.member.traffic
+    def _take_again(self, kind: type, raw: bytes) -> bool:
+        """Take the bytes of a message that was sent again; returns whether it was new."""
         try:
-            if self._early.holds(record, raw):
-                return
+            new = self._take(arrived(kind, raw), raw)
+        except RecordError as error:
+            self.member.traffic.refuse(kind, error)
+            return False
+        self.member.traffic.recovered[TOPICS[kind]] += new
+        return new
+
+    def _knows(self, kind: type, raw: bytes) -> bool:
+        try:
+            return self._bag.repeats.knows(arrived(kind, raw))
+        except RecordError:
+            return True  # nothing is to be had from it
+
+    def _take(self, record: Record, raw: bytes) -> bool:
+        """Take a record; returns whether it is new and admitted."""
+        traffic, core = self.member.traffic, cast(Recorder, self.joined.core)
+        try:
+            if self._unannounced.holds(record, raw):
+                return False
         except RecordError as error:
             traffic.refuse(type(record), error)
-            return
-        core = self.joined.core
+            return False
+        if self._came_before(record):
+            return False
+        if core.comes_early(record):  # something before it was lost
+            self._early.append(record)
+            self._sweeper.ask(self._nodes(['sim']))
+            return False
         learnt_from = type(record) in core.subscribes
+        known = core.duplicated.total()
         if not traffic.receive(record, None if learnt_from else self._beside):
-            return
-        self._write(type(record), self._kept(record, raw), stamp_of(raw))
-        self._last.hold(record, raw)
+            if core.duplicated.total() > known:
+                self._bag.repeats.note(record)  # which compares them
+            return False
+        if self._bag.repeats.note(record):
+            return False
+        self._write(record, self._kept(record, raw), stamp_of(raw))
         if isinstance(record, TaskSpec):
-            for waiting, data in self._early.announced(record.source):
+            for waiting, data in self._unannounced.announced(record.source):
                 self._take(waiting, data)
+        return True
+
+    def _came_before(self, record: Record) -> bool:
+        """Whether a record came before, and is neither of those whose number the core checks nor
+        labels, of which the bag may hold less than came.
+        """
+        if isinstance(record, (Transitions, *JUDGEMENTS, StepRewards)):
+            return False
+        if not self._bag.repeats.knows(record):
+            return False
+        self._bag.repeats.note(record)  # which compares them
+        self.joined.core.duplicated[TOPICS[type(record)]] += 1
+        return True
 
     def _kept(self, record: Record, raw: bytes) -> bytes:
         """The bytes that the bag keeps of a message: all, or only the first labels if so set."""
@@ -115,11 +204,9 @@ class Recording(Wiring):
         kept = cast(Recorder, self.joined.core).kept(record)
         return raw if kept is record else encode(kept, stamp_of(raw))
 
-    def _write(self, kind: type, raw: bytes, published: int | None = None) -> None:
+    def _write(self, record: Record, raw: bytes, published: int | None = None) -> None:
         now = self.member.link.node.get_clock().now().nanoseconds
-        if self._bag is not None:
-            self._bag.write(self._full[kind], raw, now, published)
-        self._recorded[TOPICS[kind]] += 1
+        self._bag.write(record, raw, now, published)
 
     def deliver(self, given: Record) -> None:
         """Publish a record of the core; a commit only after all that it names is on the disk."""
@@ -127,19 +214,27 @@ class Recording(Wiring):
         if not isinstance(given, Commit):
             super().deliver(given)
             return
-        if self._bag is not None:
-            self._bag.check_room()
+        self._bag.check_room()
         raw = link.message(given)
-        self._write(Commit, raw)
-        if self._bag is not None:
-            began = time.perf_counter()
-            self._bag.flush()
-            seconds = time.perf_counter() - began
-            self._flushes.append(seconds)
-            self._flush_seconds += seconds
-            self._longest_flush = max(self._longest_flush, seconds)
-        self._last.commit(given, raw)
+        self._write(given, raw)
+        self._bag.flush()
         link.send(TOPICS[Commit], raw)
+
+    # ---- waiting
+
+    def waits(self) -> str:
+        """What the recorder waits for, in words; what was lost on the way is asked for again."""
+        core: Any = self.joined.core
+        self._early = [record for record in self._early if core.comes_early(record)][-1:]
+        lost = [TOPICS[type(record)] for record in self._early]
+        self._ask_again([*lost, *self.member.traffic.lost()])
+        return super().waits()
+
+    def _ask_again(self, lost: Collection[str]) -> None:
+        """Ask those who publish on these topics for what was lost."""
+        roles = {role for topic in lost for role in WRITERS[topic]}
+        self._sweeper.ask(self._nodes(roles))
+        self._sweeper.check()
 
     def settled(self, seconds: float) -> bool:
         """Whether all nodes have finished and all their records are in the bag.
@@ -147,26 +242,19 @@ class Recording(Wiring):
         Raises:
             NodeError: a node has ended too early, or records never arrived.
         """
-        member = self.member
-        ours = {t: n for t, n in member.link.published.items() if t in published_by(member.role)}
-        commits = {TOPICS[Commit]: self._recorded[TOPICS[Commit]]}
-        missing = still_missing(member.peers.published(), ours, member.traffic.received, commits)
-        member.traffic.lost_for_good = missing
+        member, traffic = self.member, self.member.traffic
+        arrived_ = traffic.received + traffic.recovered
+        missing = traffic.ledger.owed(member.all_published(), arrived_)
+        traffic.lost_for_good = missing
         settled, member.doing = self._settling.check(missing, seconds, time.monotonic())
+        if not settled:
+            self._ask_again(missing)
         return settled
 
     def close(self) -> None:
         """Finish the bag."""
-        if self._bag is not None:
-            self._bag.close()
+        self._bag.close()
 
     def report(self) -> BagReport:
         """What was recorded, and where."""
-        median = 1e3 * sorted(self._flushes)[len(self._flushes) // 2] if self._flushes else 0.0
-        return BagReport(
-            recorded=dict(self._recorded),
-            bag=str(self._bag.folder) if self._bag else None,
-            bag_bytes=self._bag.size if self._bag else 0,
-            flush_seconds=self._flush_seconds,
-            flush_ms=FlushTimes(median=median, max=1e3 * self._longest_flush),
-        )
+        return self._bag.report()

@@ -1,49 +1,139 @@
-"""Sends a committed phase again to a node that lacks some of it."""
+"""Sends a phase again to a node that lacks some of it, in parts."""
+
+from collections.abc import Callable, Collection, Iterable
 
 from codetr_msgs.srv import FetchPhase
 
+from codetr_ros.bags.errors import BagError
 from codetr_ros.nodes.last_phases import LastPhases
+from codetr_ros.nodes.outbox import Outbox
 from codetr_ros.records.fields import type_name
 from codetr_ros.records.shown import shown
-from codetr_ros.ros.fetch import SERVICE
+from codetr_ros.ros.fetch import SERVICE, service_of
 from codetr_ros.ros.link import Link
+
+PART_BYTES = 4_000_000
+"""Bytes of messages in an answer, unless one message has more."""
+
+MOST_REQUESTERS = 100
+"""Nodes of which is remembered what they were sent."""
+
+Read = Callable[[int, Collection[str]], Iterable[tuple[type, bytes]]]
+"""Kind and bytes of each message of a phase that is of a wanted type, of any if none is named.
+A phase that is not held is a `KeyError`, whose message names those that are."""
+
+
+class PhaseService:
+    """A service of type `FetchPhase`.
+
+    Args:
+        link: the node's connection.
+        service: its name.
+        run_id: the run.
+        read: reads a phase.
+        newest: returns the newest phase that can be read; None if there is none.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        service: str,
+        run_id: str,
+        read: Read,
+        newest: Callable[[], int | None],
+    ) -> None:
+        self._who = link.full_name
+        self._log = link.node.get_logger()
+        self._run_id = run_id
+        self._read = read
+        self._newest = newest
+        self._sent: dict[str, int] = {}  # the phase that was sent last, by requester
+        link.node.create_service(FetchPhase, service, self._send)
+
+    def _send(
+        self, request: FetchPhase.Request, response: FetchPhase.Response
+    ) -> FetchPhase.Response:
+        if request.run_id != self._run_id:
+            response.reason = (
+                f'{self._who} is of run {self._run_id!r}, not {shown(repr(request.run_id))}: ask '
+                'the nodes of your run'
+            )
+            return response
+        phase = request.phase
+        if phase == FetchPhase.Request.NEWEST:
+            newest = self._newest()
+            if newest is None:
+                response.found, response.phase, response.parts = True, phase, 1
+                return response
+            phase = newest
+        try:
+            parts = _parts(self._read(phase, request.kinds))
+            part = parts[request.part]
+        except KeyError as error:
+            response.reason = str(error.args[0])
+            return response
+        except IndexError:
+            response.reason = f'phase {phase} has {len(parts)} parts, not {request.part + 1}'
+            return response
+        except (BagError, OSError) as error:
+            response.reason = f'phase {phase} cannot be read: {error}'
+            self._log.error(response.reason)
+            return response
+        self._note(request.requester, phase)
+        response.found, response.phase, response.parts = True, phase, len(parts)
+        response.types = [type_name(kind) for kind, _ in part]
+        response.lengths = [len(raw) for _, raw in part]
+        response.cdr = b''.join(raw for _, raw in part)
+        return response
+
+    def _note(self, requester: str, phase: int) -> None:
+        """Log who lacks something, once where a node asks for one phase after the other."""
+        before = self._sent.get(requester)
+        if len(self._sent) > MOST_REQUESTERS:
+            self._sent.clear()
+        self._sent[requester] = phase
+        if before is None or phase not in (before, before + 1):
+            self._log.warning(
+                f'{shown(requester)} lacks something of phase {phase}: sending it again'
+            )
+
+
+def _parts(messages: Iterable[tuple[type, bytes]]) -> list[list[tuple[type, bytes]]]:
+    """Messages in parts of at most `PART_BYTES`, at least one."""
+    parts: list[list[tuple[type, bytes]]] = [[]]
+    size = 0
+    for kind, raw in messages:
+        if parts[-1] and size + len(raw) > PART_BYTES:
+            parts.append([])
+            size = 0
+        parts[-1].append((kind, raw))
+        size += len(raw)
+    return parts
 
 
 class Resender(LastPhases):
     """The last phases, and the service `fetch_phase` that sends one of them.
 
     Args:
-        link: the node's connection.
+        link: the recorder's connection.
         run_id: the run.
-        phases: how many to hold.
+        phases: how many are held.
     """
 
     def __init__(self, link: Link, run_id: str, phases: int) -> None:
         super().__init__(phases)
-        self._log = link.node.get_logger()
-        self._run_id = run_id
-        link.node.create_service(FetchPhase, SERVICE, self._send)
+        PhaseService(link, SERVICE, run_id, self.read, lambda: self.newest)
 
-    def _send(
-        self, request: FetchPhase.Request, response: FetchPhase.Response
-    ) -> FetchPhase.Response:
-        if request.run_id != self._run_id:
-            other = shown(repr(request.run_id))
-            response.reason = (
-                f'this recorder is of run {self._run_id!r}, not {other}: ask that of your run'
-            )
-            return response
-        try:
-            phase = self.get(request.phase)
-        except KeyError as error:
-            response.reason = str(error.args[0])
-            return response
-        self._log.warning(
-            f'{shown(request.requester)} lacks something of phase {request.phase}: sending it '
-            'again'
-        )
-        response.found = True
-        response.types = [type_name(kind) for kind, _ in phase]
-        response.lengths = [len(raw) for _, raw in phase]
-        response.cdr = b''.join(raw for _, raw in phase)
-        return response
+    def read(self, phase: int, kinds: Collection[str]) -> list[tuple[type, bytes]]:
+        """Kind and bytes of each message of a committed phase."""
+        held = self.get(phase)
+        return [(kind, raw) for kind, raw in held if not kinds or type_name(kind) in kinds]
+
+
+def serve_outbox(link: Link, run_id: str, outbox: Outbox) -> None:
+    """Offer to send again what a node has published lately."""
+
+    def read(phase: int, kinds: Collection[str]) -> list[tuple[type, bytes]]:
+        return [(type(record), link.message(record)) for record in outbox.read(phase, kinds)]
+
+    PhaseService(link, service_of(link.full_name), run_id, read, lambda: outbox.newest)

@@ -8,6 +8,7 @@ from codetr_ros.ros.course import Course
 from codetr_ros.ros.gathering import IDLE, absent_or_unmatched
 from codetr_ros.ros.joining import Joined
 from codetr_ros.ros.membership import Membership
+from codetr_ros.ros.restoring import go_on
 from codetr_ros.runs.reports import BagReport
 
 
@@ -34,7 +35,9 @@ class Wiring:
         self.member.publish_presence()
 
     def open(self) -> None:
-        """Subscribe to what the core wants."""
+        """Subscribe to what the core wants, and offer what is published once more."""
+        self.member.keep_published(self.joined.settings)
+        self.member.traffic.hold()
         for kind in self.joined.core.subscribes:
             self.member.link.subscribe(kind, self.take, self.joined.settings)
 
@@ -51,9 +54,18 @@ class Wiring:
         run, settings = self.joined.run, self.joined.settings
         return absent_or_unmatched(self.member, settings, run.settings_hash, settings.roles)
 
+    def go_on(self) -> bool:
+        """Let the core be as it was, if the run has begun without it or it was killed; false if
+        asked to stop meanwhile.
+        """
+        if not go_on(self.member, self.joined):
+            return False
+        self.member.traffic.release()
+        return True
+
     def deliver(self, given: Any) -> None:
         """Publish what the core yielded: a record."""
-        self.member.link.publish(given)
+        self.member.publish(given)
 
     def show(self, given: Sequence[Any], doing: str) -> None:
         """Log how far the node has come, if it is time for a line.

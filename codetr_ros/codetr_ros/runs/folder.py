@@ -138,6 +138,12 @@ def read_settings(folder: Path) -> config.Settings:
     return config.load(str(path))
 
 
+def forget_reports(folder: Path) -> None:
+    """Remove the reports of the nodes of a run that is gone on with: they write new ones."""
+    for path in (folder / NODES).glob('*.json'):
+        path.unlink()
+
+
 def _file_name(text: str) -> str:
     return re.sub(r'[^A-Za-z0-9_.]+', '_', text).strip('_') or 'unnamed'
 

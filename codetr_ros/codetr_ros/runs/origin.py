@@ -7,6 +7,7 @@ import fcntl
 import json
 import os
 import platform
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
@@ -117,24 +118,40 @@ def differences(made: Origin, settings: Settings) -> list[str]:
 
 
 @contextmanager
-def held(folder: Path) -> Iterator[None]:
+def held(folder: Path, patience: float = 0.0) -> Iterator[int]:
     """Hold a run's folder: no other process of this machine can go on with the run meanwhile.
+
+    Args:
+        folder: of the run.
+        patience: seconds to wait for another process to end.
+
+    Yields:
+        A descriptor; a process to which it is handed on holds the folder too.
 
     Raises:
         RunFolderError: another process holds it.
     """
     # the folder itself: files in it are replaced
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    end = time.monotonic() + patience
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise RunFolderError(
-                f'the run in {folder} is under way in another process: end that one first'
-            ) from None
-        yield
+        while not _locked(descriptor):
+            if time.monotonic() > end:
+                raise RunFolderError(
+                    f'the run in {folder} is under way in another process: end that one first'
+                )
+            time.sleep(0.1)
+        yield descriptor
     finally:
         os.close(descriptor)
+
+
+def _locked(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def _now() -> str:

@@ -93,6 +93,7 @@ def details(summary: RunSummary) -> Iterator[Block]:
             'finished': row.finished,
             'error': row.error,
             'exit code': row.exit_code,
+            'started again': row.restarts,
         }
         for name, row in summary.processes.items()
     ]

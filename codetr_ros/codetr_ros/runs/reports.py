@@ -110,6 +110,9 @@ class NodeReport(BagReport, CoreReport, _Wired):
         None,
         description='exit code of its process; not in the file, since its parent process adds it',
     )
+    restarts: int | None = Field(
+        None, description='how often it was started again; its parent process adds it'
+    )
 
 
 def node_report(
@@ -184,6 +187,18 @@ def read(path: Path) -> NodeReport:
     return facts.read(
         NodeReport, path, 'node report', 'remove the file, a summary can do without it'
     )
+
+
+def has_finished(folder: Path, role: str, name: str | None = None) -> bool:
+    """Whether a node has done everything, by the report that it has left.
+
+    Args:
+        folder: of the run.
+        role: the node's role.
+        name: its name; None: that of its role.
+    """
+    path = run_folder.report_path(folder, role, name or role)
+    return path.is_file() and read(path).finished is True
 
 
 def read_all(folder: Path) -> dict[str, NodeReport]:

@@ -99,6 +99,9 @@ class ProcessUse(Facts):
     finished: bool | None = Field(description='whether it did everything that the run asked of it')
     error: str | None = Field(description='why it gave up')
     exit_code: int | None = Field(description='exit code; -N: ended by signal N')
+    restarts: int | None = Field(
+        None, description='how often it was started again after it had been killed'
+    )
 
 
 class RunSummary(Facts):

@@ -42,6 +42,7 @@ def processes(reports: Mapping[str, NodeReport]) -> dict[str, ProcessUse]:
             finished=report.finished,
             error=report.error,
             exit_code=report.exit_code,
+            restarts=report.restarts,
         )
         for name, report in sorted(reports.items())
     }
@@ -54,5 +55,6 @@ def processes(reports: Mapping[str, NodeReport]) -> dict[str, ProcessUse]:
         finished=None,
         error=None,
         exit_code=None,
+        restarts=None,
     )
     return used

@@ -1,0 +1,66 @@
+"""What a node has published lately, to be sent again to whom it did not reach."""
+
+from collections.abc import Collection, Iterator
+
+from codetr_ros.records import Presence, Record, RunSpec
+from codetr_ros.records.fields import type_name
+from codetr_ros.records.identity import identity, phase_of
+
+NOT_KEPT = (Presence, RunSpec)
+"""Published again and again, or by other means."""
+
+
+class Outbox:
+    """Records that a node has published, by phase; of the newest phases only.
+
+    Nobody publishes for a phase that was not permitted, and the learner permits one only when
+    those that lie `lag` behind are committed. So a few phases more than `lag` cover all that any
+    reader can lack, however long nothing has reached it. What the evaluator publishes, which
+    nobody waits for, is small, and all of it is kept.
+
+    Args:
+        phase_steps: environment steps of a phase.
+        phases: how many are kept; None: all.
+    """
+
+    def __init__(self, phase_steps: int, phases: int | None) -> None:
+        self._phase_steps = phase_steps
+        self._most = phases
+        self._phases: dict[int, dict[object, Record]] = {}
+        self._phase = 0  # of the last record that named one
+
+    @property
+    def newest(self) -> int | None:
+        """The newest phase of which something is kept; None if nothing is."""
+        return max(self._phases, default=None)
+
+    def keep(self, record: Record) -> None:
+        """Keep a record that is published; one that was published before takes its place."""
+        if isinstance(record, NOT_KEPT):
+            return
+        phase = phase_of(record, self._phase_steps)
+        if phase is not None:
+            self._phase = phase
+        key = type(record), identity(record)
+        self._phases.setdefault(self._phase, {})[key] = record
+        while self._most is not None and len(self._phases) > self._most:
+            del self._phases[min(self._phases)]
+
+    def read(self, phase: int, kinds: Collection[str] = ()) -> Iterator[Record]:
+        """The records of a phase, in the order in which they were published.
+
+        Args:
+            phase: the phase.
+            kinds: types of the messages that are wanted; empty: all.
+
+        Raises:
+            KeyError: nothing of it is kept; the message names the phases of which something is.
+        """
+        if phase not in self._phases:
+            held = ', '.join(map(str, sorted(self._phases))) or 'none yet'
+            raise KeyError(f'nothing of phase {phase} is kept; of these is: {held}')
+        return (
+            record
+            for record in self._phases[phase].values()
+            if not kinds or type_name(type(record)) in kinds
+        )

@@ -1,0 +1,104 @@
+"""Fetches what a learner or reward node lacks: committed phases from the recorder, labels from the
+reward node.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from codetr_ros.cores.core import Core
+from codetr_ros.nodes.fetching import Fetching
+from codetr_ros.nodes.peers import Peers
+from codetr_ros.records import Commit, CompositeReward, Preference, StepRewards, Transitions
+from codetr_ros.records.fields import type_name
+from codetr_ros.ros.fetch import SERVICE, Answer, Asker, service_of
+from codetr_ros.ros.link import Link
+
+OF_PHASES = (Transitions, CompositeReward, Preference, Commit)
+"""Kinds of records that a commit names, and itself."""
+
+RECORDER = 'the recorder'
+
+TakeAgain = Callable[[type, bytes], object]
+"""Takes the bytes of a message that was fetched again."""
+
+
+class Fetcher:
+    """Asks for a phase, or for labels, that stay incomplete.
+
+    Args:
+        link: the node's connection.
+        run_id: the run.
+        peers: the other nodes.
+        take: takes each message that comes.
+
+    Attributes:
+        behind: phases up to this one were committed when the node joined: nothing of them is
+            under way any more.
+    """
+
+    def __init__(self, link: Link, run_id: str, peers: Peers, take: TakeAgain) -> None:
+        self._link = link
+        self._log = link.node.get_logger()
+        self._run_id = run_id
+        self._peers = peers
+        self._take = take
+        self._recorder = Asker(link, SERVICE, run_id)
+        self._reward: tuple[str, Asker] | None = None
+        self._phases, self._labels = Fetching(), Fetching()
+        self._kinds: tuple[type, ...] = ()  # that the core takes in
+        self._fetched: Callable[[int], None]  # lets the core know that a phase was sent again
+        self.behind = -1
+
+    def check(self, core: Core[Any]) -> None:
+        """Ask for what the core has lacked for a while."""
+        now = time.monotonic()
+        missing, unlabelled = core.missing, core.unlabelled
+        if self._phases.due(missing, now, missing is not None and missing <= self.behind):
+            assert missing is not None
+            self._kinds, self._fetched = core.subscribes, core.fetched
+            self._ask_recorder(missing)
+        behind = unlabelled is not None and unlabelled <= self.behind
+        if self._labels.due(unlabelled, now, behind):
+            assert unlabelled is not None
+            self._ask_reward(unlabelled)
+
+    def _ask_recorder(self, phase: int) -> None:
+        if not self._recorder.ready:
+            self._log.warning(
+                f'phase {phase} is incomplete, and no recorder offers {self._recorder.service!r}'
+            )
+            return
+        if phase > self.behind:
+            self._log.warning(f'phase {phase} is incomplete: asking the recorder for it')
+        kinds = [type_name(kind) for kind in OF_PHASES if kind in self._kinds]
+        self._recorder.ask(phase, lambda answer: self._arrived(RECORDER, phase, answer), kinds)
+
+    def _ask_reward(self, phase: int) -> None:
+        asker = self._reward_node()
+        if asker is not None and asker.ready:
+            kinds = [type_name(StepRewards)]
+            asker.ask(phase, lambda answer: self._labelled(phase, answer), kinds)
+
+    def _reward_node(self) -> Asker | None:
+        for peer in self._peers.alive('reward'):
+            node = peer.presence.node
+            if self._reward is None or self._reward[0] != node:
+                self._reward = node, Asker(self._link, service_of(node), self._run_id)
+            return self._reward[1]
+        return None
+
+    def _arrived(self, who: str, phase: int, answer: Answer) -> None:
+        if answer.reason:
+            self._log.error(f'{who} does not send phase {phase} again: {answer.reason}')
+            return
+        for kind, data in answer.messages:
+            self._take(kind, data)
+        if who == RECORDER:
+            self._fetched(phase)
+        if phase > self.behind or phase % 100 == 0:
+            self._log.info(f'phase {phase}: {len(answer.messages)} messages came again')
+
+    def _labelled(self, phase: int, answer: Answer) -> None:
+        if not answer.reason:  # else it has not labelled the phase yet
+            self._arrived('the reward node', phase, answer)

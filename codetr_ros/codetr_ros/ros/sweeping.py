@@ -1,0 +1,93 @@
+"""The recorder asks other nodes for what they have published lately: it was killed, or a network
+was cut.
+"""
+
+import time
+from collections.abc import Callable, Iterable
+
+from codetr_ros.nodes.fetching import AGAIN
+from codetr_ros.ros.fetch import NEWEST, Answer, Asker, service_of
+from codetr_ros.ros.link import Link
+
+UNNEWS = 3
+"""Phases of a node with nothing new in them, after which it is not asked for earlier ones."""
+
+TakeAgain = Callable[[type, bytes], bool]
+"""Takes the bytes of a message that was sent again; returns whether it was new."""
+
+
+class Sweeper:
+    """Asks one node after the other for all that it keeps, from the newest phase back, and hands
+    it on in the order in which it was published.
+
+    Args:
+        link: the recorder's connection.
+        run_id: the run.
+        known: returns whether a message came before.
+        take: takes each message that comes.
+    """
+
+    def __init__(
+        self, link: Link, run_id: str, known: Callable[[type, bytes], bool], take: TakeAgain
+    ) -> None:
+        self._link = link
+        self._log = link.node.get_logger()
+        self._run_id = run_id
+        self._known = known
+        self._take = take
+        self._askers: dict[str, Asker] = {}
+        self._wanted: dict[str, float] = {}  # nodes to be asked, and when at the earliest
+        self._asked: dict[str, float] = {}  # when each has answered last
+        self._present: str | None = None  # the node that is asked
+        self._phases: list[list[tuple[type, bytes]]] = []  # what it has sent, newest first
+        self._news = 0  # phases since one had something new
+
+    def ask(self, nodes: Iterable[str]) -> None:
+        """Ask these nodes, each as soon as it offers to answer, and not twice in `AGAIN` seconds.
+
+        Args:
+            nodes: full names.
+        """
+        for node in nodes:
+            if node != self._present:
+                self._wanted.setdefault(node, self._asked.get(node, -AGAIN) + AGAIN)
+
+    def check(self) -> None:
+        """Go on with the next node, where one has answered or does not answer any more."""
+        if self._present is not None:
+            if self._askers[self._present].busy:
+                return
+            self._wanted[self._present] = 0.0  # it was killed meanwhile: ask it once more
+            self._end()
+        now = time.monotonic()
+        for node in [node for node, due in self._wanted.items() if due <= now]:
+            asker = self._askers.get(node)
+            if asker is None:
+                asker = self._askers[node] = Asker(self._link, service_of(node), self._run_id)
+            if asker.ready:
+                del self._wanted[node]
+                self._present, self._phases, self._news = node, [], 0
+                asker.ask(NEWEST, self._answered)
+                return
+
+    def _answered(self, answer: Answer) -> None:
+        assert self._present is not None
+        if answer.phase is None:  # it keeps nothing earlier
+            self._end()
+            return
+        self._phases.append(answer.messages)
+        new = any(not self._known(kind, data) for kind, data in answer.messages)
+        self._news = 0 if new else self._news + 1
+        if self._news < UNNEWS and answer.phase > 0:
+            self._askers[self._present].ask(answer.phase - 1, self._answered)
+        else:
+            self._end()
+
+    def _end(self) -> None:
+        node, phases = self._present, self._phases
+        assert node is not None
+        self._present, self._phases = None, []
+        self._asked[node] = time.monotonic()
+        sent = [message for messages in reversed(phases) for message in messages]
+        if new := sum(self._take(kind, data) for kind, data in sent):
+            self._log.warning(f'{new} messages of {node} had not arrived: it has sent them again')
