@@ -120,7 +120,7 @@ def table(everything: list[dict[str, str]]) -> str:
         f'|{"---:|" * len(head)}',
     ]
     for row in everything:
-        cells = [row['rate'], row['control_steps'], row['deadlines_missed']]
+        cells = [row['rate'], *(row[n].removesuffix('.0') for n in MEASURED[:2])]
         cells += [row[name] for name in SHOWN]
         cells += [row['cores'], f'{row["load before"]}, {row["load after"]}', row['commit']]
         lines.append(f'| {" | ".join(cells)} |')

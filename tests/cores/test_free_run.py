@@ -12,8 +12,10 @@ from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.verify import verify
 from codetr_ros.cores.labeller import Labeller
 from codetr_ros.cores.learner import Learner
+from codetr_ros.offline.robot_report import faults, robot_page
 from codetr_ros.offline.score_course import score_course
 from codetr_ros.records import Commit, CompositeReward, Policy, RunSpec, StepRewards, Transitions
+from codetr_ros.runs.reports import NodeReport
 from helpers.builders import run
 from helpers.foreign_bags import write
 from helpers.free_runs import FreeRun, free_run
@@ -117,3 +119,14 @@ def test_the_course_of_scores_is_that_of_the_segments_by_phase(a_free_run, tmp_p
     assert course.mean(0, 100)[0] == pytest.approx(np.mean([s.value / s.length for s in scores]))
     assert course.to_csv().splitlines()[0] == 'phase,scores,score per step'
     assert np.isnan(course.mean(50, 60)[0])
+
+
+def test_the_page_on_a_robot_shows_scores_control_and_faults(a_free_run, tmp_path):
+    log = tmp_path / 'truth.jsonl'
+    log.write_text('{"time": 1, "fault": "joint stuck"}\n{"time": 2, "attempt": [0.5]}\n')
+    course = score_course(Bag(write(tmp_path / 'bag', a_free_run.records)))
+    report = NodeReport(role='sim', name='robot', counters={'control deadlines missed': 3})
+    page = robot_page('a <robot>', course, {'score': '0.5'}, 2, report, faults(log))
+    assert 'a &lt;robot&gt;' in page and 'joint stuck' in page and 'data:image/png' in page
+    assert 'control deadlines missed' in page and 'attempt' not in page
+    assert 'left no report' in robot_page('r', course, {}, 2, None, {})

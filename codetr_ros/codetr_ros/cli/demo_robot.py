@@ -25,6 +25,7 @@ from codetr_ros.system.files import atomic_write
 
 EXAMPLE = Path('examples') / 'robot_arm'
 SCORES = 'scores.csv'
+TRUTH = 'arm_truth.jsonl'
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,7 +107,7 @@ def _robot_and_inspection(
     """The processes that are none of this project's."""
     seed = ('--seed', str(settings.seed))
     python = sys.executable
-    log = str(folder / run_folder.LOGS / 'arm_truth.jsonl')
+    log = str(folder / run_folder.LOGS / TRUTH)
     arm = (python, str(example / 'stand_in.py'), *seed, '--log', log)
     ros = ('--ros-args', '-r', f'__ns:={namespace}')
     inspection = (python, str(example / 'inspection.py'), *seed, *ros)
@@ -114,21 +115,29 @@ def _robot_and_inspection(
 
 
 def _show(settings: Settings, folder: Path) -> int:
-    """Print how the scores went, and write them by phase."""
+    """Print how the scores went, and write them by phase and as a page."""
     from codetr_ros.bags.reader import Bag
+    from codetr_ros.offline.robot_report import PAGE, faults, robot_page
     from codetr_ros.offline.score_course import score_course
+    from codetr_ros.runs import reports
 
     course = score_course(Bag(folder / run_folder.BAG))
     atomic_write(folder / SCORES, course.to_csv())
     last = max(1, settings.phases // 5)
-    shown = console()
+    warmup = settings.warmup_phases
+    outcome = {}
     for name, first, end in (
-        ('random policy', 0, settings.warmup_phases),
-        ('the last fifth', settings.phases - last, settings.phases),
+        ('score per step, random policy', 0, warmup),
+        ('score per step, the last fifth', settings.phases - last, settings.phases),
     ):
         mean, error, count = course.mean(first, end)
-        shown.print(
-            f'score per step, {name}: {mean:.3f} +- {error:.3f} ({count} scores)', markup=False
-        )
-    shown.print(f'by phase: {folder / SCORES}', markup=False)
+        outcome[name] = f'{mean:.3f} ± {error:.3f} ({count} scores)'
+    robot = next((r for r in reports.read_all(folder).values() if r.role == 'sim'), None)
+    noted = faults(folder / run_folder.LOGS / TRUTH)
+    title = f'A robot in real time, {settings.steps} control steps, seed {settings.seed}'
+    atomic_write(folder / PAGE, robot_page(title, course, outcome, warmup, robot, noted))
+    shown = console()
+    for name, value in outcome.items():
+        shown.print(f'{name}: {value}', markup=False)
+    shown.print(f'{folder / PAGE}, by phase: {folder / SCORES}', markup=False)
     return 0

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from typing import Any, cast
 
 from codetr_ros.cores.robot import Robot
+from codetr_ros.robots.guard import Hold
+from codetr_ros.robots.reset import RESET
 from codetr_ros.ros.driver import Driver, shown
 from codetr_ros.ros.gathering import IDLE, wait_for
 from codetr_ros.ros.joining import Joined
@@ -61,12 +63,19 @@ class RobotWiring(Wiring):
         if newest != self._learner_at:
             self._learner_at = newest
             robot.guard.learner(robot.clock())
-        held = robot.control.held
+        self._log_held(robot.control.held if robot.control.active else None)
+
+    def _log_held(self, held: Hold | None) -> None:
+        """Log why the robot is held: at once, and again while it lasts; a reset, which every
+        episode needs, only where it lasts.
+        """
         kind, now = held.kind if held else '', time.monotonic()
-        if kind != self._held or (held and now - self._held_at > SAY_EVERY):
+        changed = kind != self._held
+        lasts = not changed and held is not None and now - self._held_at > SAY_EVERY
+        if changed or lasts:
             self._held, self._held_at = kind, now
-            if held and robot.control.active:
-                self.log.warning(f'the robot is held: {held.why}')
+        if held is not None and (lasts or (changed and kind != RESET)):
+            self.log.warning(f'the robot is held: {held.why}')
 
     def _begin(self) -> None:
         self._begun = True
