@@ -10,7 +10,6 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from codetr_ros.config import Settings, load
-from codetr_ros.records import ROLES
 from helpers.builders import tiny
 from helpers.runs import train
 
@@ -114,7 +113,7 @@ def test_the_default_run_loses_nothing_and_its_bag_holds_everything(tmp_path):
     assert 'lost' in said
     status = json.loads((tmp_path / 'run' / 'status.json').read_text())
     assert (status['state'], status['phase'], status['lost']) == ('finished', 4, 0)
-    assert {node['role'] for node in status['nodes']} == set(ROLES)
+    assert {node['role'] for node in status['nodes']} == set(settings.roles)
 
 
 @pytest.mark.slow
