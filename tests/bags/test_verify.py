@@ -22,7 +22,10 @@ from codetr_ros.records import (
     Transitions,
     TrueRewards,
 )
+from codetr_ros.records.chain import Chain
+from codetr_ros.records.digests import digest
 from helpers.bags import WRITERS, a_run, ours
+from helpers.builders import policy
 
 
 def named(path, kind=None):
@@ -401,3 +404,65 @@ def test_a_bag_without_true_rewards_and_commits_takes_no_memory_for_each_chunk()
 def test_true_rewards_that_come_behind_the_commits_are_no_fault(tmp_path):
     late = sorted(RUN, key=lambda record: isinstance(record, TrueRewards))
     assert verify(ours(tmp_path / 'bag', late)).sound
+
+
+def proven(records):
+    """The same records, with the digests that our recorder states in its commits."""
+    chain, out = Chain(1), []
+    for record in records:
+        if isinstance(record, Commit):
+            out.append(chain.completed(record))
+            chain.follow(out[-1])
+        else:
+            chain.note(record)
+            out.append(record)
+    return out
+
+
+PERMITTED = [policy(phase=n, sources=('sim',), steps=np.array([20], np.uint32)) for n in range(3)]
+LABELLED = replace(LABELS, phase=0)
+
+
+def with_labels(records):
+    """The run with its policies, and with labels behind its first commit."""
+    first = next(i for i, r in enumerate(records) if isinstance(r, Commit))
+    return [*PERMITTED, *records[: first + 1], LABELLED, *records[first + 1 :]]
+
+
+PROVEN = proven(with_labels(RUN))
+TAMPERED = {
+    'a score': (
+        3, CompositeReward, {'value': 0.25}, "composite rewards of 'sim' .numbers: 0 to 3",
+    ),
+    'an observation': (
+        4, Transitions, {'actions': bad(CHUNK.actions, 0.5)}, "transitions of 'sim' .numbers: 4",
+    ),
+    'a label': (0, StepRewards, {'labels': bad(LABELS.labels, 0.5)}, 'the labels of phase 0'),
+    'a policy': (1, Policy, {'version': 5}, 'the policy of phase 1'),
+    'a commit': (0, Commit, {'policy_digest': 'ab'}, 'the commit of phase 0'),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('what', TAMPERED)
+def test_a_value_that_was_changed_with_its_checksum_is_found_and_named(what, tmp_path):
+    """A well-formed lie: the file is whole, and every CRC is right."""
+    assert verify(ours(tmp_path / 'sound', PROVEN)).sound
+    at, kind, changes, said = TAMPERED[what]
+    lie = ours(tmp_path / 'bag', changed(PROVEN, at, kind, **changes))
+    found = named(lie, 'digest')
+    assert any(re.search(said, text) for text in found), found
+    assert set(verify(lie).findings.counts) == {'digest'}
+
+
+def test_labels_that_claim_another_commit_are_found(tmp_path):
+    made_of = next(digest(r) for r in PROVEN if isinstance(r, Commit))
+    sound = changed(PROVEN, 0, StepRewards, commit=made_of)
+    assert verify(ours(tmp_path / 'sound', sound)).sound
+    lie = ours(tmp_path / 'bag', changed(PROVEN, 0, StepRewards, commit='ab' * 32))
+    assert any('was made of another commit' in text for text in named(lie, 'digest'))
+
+
+def test_commits_without_digests_are_no_fault_and_remarked(tmp_path):
+    verdict = verify(ours(tmp_path / 'bag', RUN))
+    assert verdict.sound
+    assert any('3 commits state no digests' in text for text in verdict.findings.remarks)
