@@ -156,7 +156,9 @@ class Intake:
 
     def fetched(self, phase: int) -> None:
         """Note that everything of a phase has been sent again by the recorder."""
-        self._fetched = phase
+        # of a phase that only lacked something, second records of a number were not looked at
+        if self.doubt:
+            self._fetched = phase
 
     def take(self, phase: int, memory: Trajectories) -> bool:
         """Add all records that the phase's commit names to the memory, ordered by source and

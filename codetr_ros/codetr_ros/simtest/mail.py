@@ -4,8 +4,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from codetr_ros.bags.definitions import decode, encode
-from codetr_ros.records import Presence
-from codetr_ros.simtest.network import Handle, Network, Weather
+from codetr_ros.records import CompositeReward, Presence, Record, Transitions
+from codetr_ros.simtest.network import FETCHED_AGAIN, Handle, Network, Weather
 from codetr_ros.simtest.process import Packet, Process
 from codetr_ros.simtest.recording import RECORDED
 from codetr_ros.simtest.world import World
@@ -14,6 +14,14 @@ STRANGER = 'stranger'
 """The run of messages that are of another one."""
 Watch = Callable[[type, bytes, Process], None]
 """Looks at a message that arrives at a node."""
+
+
+def forged(record: Record) -> Record:
+    """Steps or a score of the same number that are well-formed, and wrong."""
+    if isinstance(record, Transitions):
+        return replace(record, actions=-record.actions)
+    assert isinstance(record, CompositeReward)
+    return replace(record, value=record.value + 1)
 
 
 class Post:
@@ -50,6 +58,11 @@ class Post:
             for each in self.processes.values()
             if self._reads(each, kind) and not (each is sender and ours)
         ]
+        if kind in FETCHED_AGAIN and self._world.rng.random() < self._weather.lies:
+            lie = Packet(kind, self._world.number(), encode(forged(decode(kind, packet.data))))
+            for reader in readers:
+                if reader != 'record':
+                    self._world.at(self._world.now, self._arrives(reader, lie))
         self.network.publish(sender.name, readers, kind, lambda name: self._arrives(name, packet))
         if kind is not Presence and self._world.rng.random() < self._weather.strangers:
             strange = replace(decode(kind, packet.data), run_id=STRANGER)

@@ -58,6 +58,7 @@ class Weather:
         lost: share of those messages that never arrive which a reader can fetch again.
         overrun: share of those messages that never arrive at the recorder.
         strangers: share of messages that arrive once more, as if they were of another run.
+        lies: share of steps and scores of which learner and reward node get a forged copy first.
         partitions: when it falls into parts.
     """
 
@@ -67,6 +68,7 @@ class Weather:
     lost: float = 0.0
     overrun: float = 0.0
     strangers: float = 0.0
+    lies: float = 0.0
     partitions: tuple[Partition, ...] = ()
 
 

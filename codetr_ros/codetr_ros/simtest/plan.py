@@ -85,6 +85,7 @@ class Plan:
             or weather.lost
             or weather.overrun
             or weather.strangers
+            or weather.lies
             or weather.partitions
             or any(pace.stalls for pace in self.paces.values())
             or self.disk != Trouble()
@@ -111,6 +112,8 @@ class Plan:
             lines.append(f'{weather.overrun:.0%} of those never arrive at the recorder')
         if weather.strangers:
             lines.append(f'{weather.strangers:.0%} come once more as of another run')
+        if weather.lies:
+            lines.append(f'of {weather.lies:.0%} of steps and scores forged ones come first')
         lines += [
             f'from {p.begin:.1f} s for {p.seconds:.1f} s {", ".join(sorted(p.apart))} and the '
             'others do not reach each other'
@@ -153,6 +156,7 @@ def plan(seed: int) -> Plan:
         lost=some.share(0.4),
         overrun=0.03 if some.happens(0.06) else 0.0,
         strangers=0.05 if some.happens(0.2) else 0.0,
+        lies=0.1 if some.happens(0.2) else 0.0,
         partitions=partitions,
     )
     paces = {

@@ -262,6 +262,7 @@ class Process:
             for kind, raw in packet.data.messages:
                 self.traffic.take_again(kind, raw)
             self.core.fetched(packet.data.phase)
+            self.core.fetched(packet.data.phase)
         else:
             self.take(packet.kind, packet.data)
 

@@ -174,6 +174,8 @@ class Simulated:
 
     def dropped(self) -> list[str]:
         """The sources that were left out, once for each phase."""
+        if not isinstance(self.processes['record'], Recording):
+            return []  # its disk was full from the beginning
         there = (decode(kind, raw) for kind, raw in self.recording.history)
         return [source for each in there if isinstance(each, Commit) for source in each.dropped]
 
