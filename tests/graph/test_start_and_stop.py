@@ -256,9 +256,10 @@ def test_ctrl_c_leaves_no_process_behind(interrupted):
 
 
 @pytest.mark.slow
-def test_a_node_that_is_killed_ends_the_run_which_names_it_and_leaves_no_process(tmp_path):
+def test_a_killed_node_that_is_not_started_again_ends_the_run_which_names_it(tmp_path):
     folder = tmp_path / 'run'
-    command = start_installed(write(tiny(steps=ENDLESS, memory_steps=10_000), folder), folder)
+    config = write(tiny(steps=ENDLESS, memory_steps=10_000), folder)
+    command = start_installed(config, folder, '--restarts', '0')
     try:
         until(lambda: saved_by_both(folder), command, folder)
         for number, words in processes_of(folder):
