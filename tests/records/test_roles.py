@@ -4,6 +4,7 @@ import sys
 
 import pytest
 
+from codetr_ros.cores.people import SimulatedPeople
 from codetr_ros.cores.recorder import Recorder
 from codetr_ros.records import ROLES, TOPICS, Presence
 from codetr_ros.records.roles import (
@@ -20,7 +21,7 @@ from helpers.builders import tiny
 
 FLOW = """
 run                learner                                sim evaluate reward score record
-task               sim                                    learner reward score record
+task               sim                                    learner reward record
 policy             learner                                sim evaluate record
 transitions        sim                                    record reward learner score
 composite_rewards  sim score                              record reward
@@ -70,6 +71,10 @@ def test_every_kind_of_record_is_published_and_read_by_somebody():
 
 def test_the_recorder_reads_what_decides_when_a_phase_is_whole():
     assert set(Recorder.subscribes) < set(subscribed('record'))
+
+
+def test_simulated_people_read_what_others_wait_for_them_to_read():
+    assert set(SimulatedPeople.subscribes) == set(subscribed('score'))
 
 
 def test_a_node_relies_only_on_roles_that_publish_what_it_reads():

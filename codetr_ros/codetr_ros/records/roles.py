@@ -104,7 +104,7 @@ TABLE: dict[str, Role] = {
     'score': Role(
         'codetr_ros', 'score',
         publishes=(CompositeReward, Preference),
-        reads=(RunSpec, TaskSpec, Transitions, TrueRewards, ScoreRequest, Commit),
+        reads=(RunSpec, Transitions, TrueRewards, ScoreRequest, Commit),
         relies_on=('sim', 'record'),
         # nobody waits for a person, who may come and go
         count=lambda settings: int(settings.scorer == 'simulated'),
