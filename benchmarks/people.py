@@ -8,7 +8,8 @@ where it ended.
     python benchmarks/people.py [--only TASK ...] [--seeds 2] [--budgets 60 30 120 15]
 
 Columns of results/people.csv: the task, judgements that people may give in the run (`oracle`: true
-rewards), points of their scale, share of preferences, people, seed, judgements that were given,
+rewards), points of their scale, segments asked for
+in each phase, share of preferences, people, seed, judgements that were given,
 mean true return of the last evaluation and of the random policy, and the wall time. The goal is
 90 % of the way from the random policy to the oracle with 60 judgements.
 """
@@ -28,8 +29,8 @@ from codetr_ros.records import CompositeReward, EpisodeResult, Preference, Recor
 
 RESULTS = Path(__file__).parent / 'results' / 'people.csv'
 COLUMNS = (
-    *('task', 'budget', 'points', 'preferences', 'people', 'seed', 'given', 'final', 'random'),
-    'wall_s',
+    *('task', 'budget', 'points', 'requests', 'preferences', 'people', 'seed'),
+    *('given', 'final', 'random', 'wall_s'),
 )
 TASKS: dict[str, dict[str, Any]] = {
     'Reacher-v5': {'delay': 50, 'steps': 20_000, 'people.best': -3.0},
@@ -50,7 +51,13 @@ COMMON: dict[str, Any] = {
 
 
 def settings_of(
-    task: str, budget: str, points: int, preferences: float, people: int, seed: int
+    task: str,
+    budget: str,
+    points: int,
+    requests: int,
+    preferences: float,
+    people: int,
+    seed: int,
 ) -> Settings:
     """The settings of one run."""
     changes = {'task': task, 'seed': seed, **COMMON, **TASKS[task]}
@@ -61,7 +68,7 @@ def settings_of(
         changes |= {
             'scorer': 'simulated',
             'people.judgements': int(budget),
-            'requests': asked(int(budget), changes['steps']),
+            'requests': requests,
             'people.points': points,
             'people.preferences': preferences,
             'people.count': people,
@@ -76,7 +83,13 @@ def asked(budget: int, steps: int) -> int:
 
 
 def done(
-    task: str, budget: str, points: int, preferences: float, people: int, seed: int
+    task: str,
+    budget: str,
+    points: int,
+    requests: int,
+    preferences: float,
+    people: int,
+    seed: int,
 ) -> list[object]:
     """Do a run; the rest of its row."""
     given = 0
@@ -93,7 +106,7 @@ def done(
             given += 1
 
     began = time.monotonic()
-    settings = settings_of(task, budget, points, preferences, people, seed)
+    settings = settings_of(task, budget, points, requests, preferences, people, seed)
     in_process.run(settings, 'people', None, observe)
     last = final[max(final)]
     means = [sum(values) / len(values) for values in (last, random)]
@@ -110,14 +123,18 @@ def main() -> None:
     parser.add_argument('--preferences', type=float, default=0.0)
     parser.add_argument('--people', type=int, default=1)
     parser.add_argument('--points', type=int, default=5)
+    parser.add_argument('--requests', type=int, default=0, help='0: even over the run')
     given = parser.parse_args()
     torch.set_num_threads(1)
-    table = Rows(RESULTS, COLUMNS, keys=6)
+    table = Rows(RESULTS, COLUMNS, keys=7)
     for seed in range(given.seeds):
         for budget in ('oracle', *given.budgets):
             for task in given.only:
-                asked = (given.points, given.preferences, given.people)
-                how = (0, 0.0, 0) if budget == 'oracle' else asked
+                how: tuple[float, ...] = (0, 0, 0.0, 0)
+                if budget != 'oracle':
+                    evenly = asked(int(budget), TASKS[task]['steps'])
+                    requests = given.requests or evenly
+                    how = (given.points, requests, given.preferences, given.people)
                 key = (task, budget, *how, seed)
                 if key not in table:
                     table.append([*key, *done(task, budget, *how, seed)])
