@@ -140,7 +140,7 @@ class Commits:
         shares = self._settings.shares_of(commit.phase)
         due = {name for name, n in zip(self._tasks.sources, shares, strict=True) if n}
         named, dropped = set(commit.sources), set(commit.dropped)
-        absent = {name for name in due if name in self._absent}
+        absent = {name for name in due if self._absent.may_lack(name)}
         if (
             not due - absent <= named <= due
             or not dropped < named

@@ -78,15 +78,23 @@ class Absent:
 
     def __init__(self) -> None:
         self._sources: set[str] = set()
+        self._unnamed: set[str] = set()  # since a commit that dropped them
 
     def follow(self, commit: Commit) -> None:
         """Take note of who was left out of a phase, and of who was part of it."""
         self._sources -= set(commit.sources)
         self._sources |= set(commit.dropped)
+        self._unnamed = self._unnamed - set(commit.sources) | set(commit.dropped)
 
     def announced(self, source: str) -> None:
         """Take note that a source is there."""
         self._sources.discard(source)
+
+    def may_lack(self, source: str) -> bool:
+        """Whether the next commit need not name a source: it may have announced itself again only
+        after the phase was permitted.
+        """
+        return source in self._unnamed
 
     def __contains__(self, source: object) -> bool:
         return source in self._sources
