@@ -27,6 +27,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from codetr_ros.config import USUAL, Settings, from_text, load
+from codetr_ros.nodes import signing
 from codetr_ros.records.roles import TABLE
 from codetr_ros.ros.parameters import FIELDS, as_parameters
 
@@ -84,6 +85,7 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     named = {role: role for role in settings.roles if role != 'sim'}
     if value['start_simulators'].perform(context).lower() == 'true':
         named |= dict.fromkeys(settings.simulator_names, 'sim')
+    key = signing.environment()  # that only these nodes have
     processes = {
         name: Node(
             package=TABLE[role].package,
@@ -94,6 +96,7 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             sigterm_timeout=STOP_DEADLINE,
             sigkill_timeout=STOP_DEADLINE,
             parameters=[shared | own.get(role, {})],
+            additional_env=key,
         )
         for name, role in named.items()
     }

@@ -73,21 +73,22 @@ class Play:
 
     def say(self):
         for role, link in self.links.items():
-            topics = published_by(role)
-            counts = [link.published[t] + self.claimed.get(t, 0) for t in topics]
-            link.publish(
-                Presence(
-                    run_id=self.spec.run_id,
-                    role=role,
-                    node=link.full_name,
-                    instance_id=f'{role} of the test',
-                    settings_hash=self.spec.settings_hash,
-                    finished=self.finished,
-                    topics=topics,
-                    published=np.array(counts, np.uint64),
-                    missed=0,
-                )
-            )
+            link.publish(self.presence_now(role))
+
+    def presence_now(self, role):
+        link, topics = self.links[role], published_by(role)
+        counts = [link.published[t] + self.claimed.get(t, 0) for t in topics]
+        return Presence(
+            run_id=self.spec.run_id,
+            role=role,
+            node=link.full_name,
+            instance_id=link.instance,
+            settings_hash=self.spec.settings_hash,
+            finished=self.finished,
+            topics=topics,
+            published=np.array(counts, np.uint64),
+            missed=0,
+        )
 
     def until(self, found, node=None):
         """Spin, saying presence, until `found()` is true; returns what it returns."""

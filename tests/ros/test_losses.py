@@ -2,7 +2,6 @@
 
 import json
 from collections import Counter
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from codetr_msgs.srv import FetchPhase
 from diagnostic_msgs.msg import DiagnosticArray
 from rosbags.highlevel import AnyReader
 
-from codetr_ros.bags.definitions import decode, encode
+from codetr_ros.bags.definitions import decode
 from codetr_ros.records import (
     Commit,
     CompositeReward,
@@ -103,6 +102,9 @@ def test_waiting_is_not_pointless_as_long_as(member, waiting, deadline, lost):
     member.patience(['commits']).check(1e6, waiting, 'waits', lost)
 
 
+REFUSED = (9,)
+
+
 class Core:
     """A core that has seen some trouble."""
 
@@ -116,7 +118,7 @@ class Core:
         self.refused = Counter(composite_rewards=3)
 
     def receive(self, record):
-        if record.sequence < 0:
+        if record.sequence in REFUSED:
             raise RecordError('no')
         self.duplicated['transitions'] += record.sequence == 0
 
@@ -152,15 +154,17 @@ def test_diagnostics_tell_what_the_core_has_dropped_and_refused_later(member, pl
     assert status.level == b'\x01'
 
 
-def test_what_came_and_was_refused_is_not_lost(member):
-    wrong = encode(replace(transitions(), actions=np.zeros(3, np.float32)))  # not what it says
-    member.take(Transitions, wrong)
+def test_what_came_and_was_refused_is_not_lost(member, play):
+    play = play(roles=('sim',))
+    sim = play.links['sim']
+    for record in (play.presence_now('sim'), transitions(sequence=9)):
+        member.take(type(record), sim.message(record))
     assert member.traffic.refused == {'transitions': 1}
     assert member.traffic.received == {'transitions': 1}
 
 
 def test_what_is_fetched_counts_as_recovered_only_if_it_was_new_and_taken(member):
-    for record in (transitions(sequence=0), transitions(sequence=-1), transitions(sequence=4)):
+    for record in (transitions(sequence=0), transitions(sequence=9), transitions(sequence=4)):
         member.traffic.receive_again(record)
     assert member.traffic.recovered == {'transitions': 1}
 

@@ -194,10 +194,11 @@ def test_bytes_are_decoded_and_encoded_without_ros_as_ros_does(record_type):
             assert ours == theirs, field.name
 
 
-def test_a_stamp_is_the_only_thing_that_a_message_adds():
+def test_a_message_adds_a_stamp_its_sender_and_a_signature():
     for record_type in TOPICS:
         names = list(messages.message_type(record_type).get_fields_and_field_types())
-        assert names == ['stamp', *(f.name for f in fields(record_type))]
+        own = [f.name for f in fields(record_type)]
+        assert names == ['stamp', *own, 'sender', 'signature']
 
 
 def test_arrived_arrays_are_memory_of_our_own():

@@ -27,6 +27,8 @@ from codetr_ros.records.fields import RECORD_TYPES, record_of, type_name
 
 _TEXTS = Path(__file__).parent / 'msg'  # the files of the message package itself
 _TIME = {'builtin_interfaces/msg/Time': 'int32 sec\nuint32 nanosec'}
+SIGNATURE_BYTES = 32
+"""The last bytes of a message: zeros where it is not signed."""
 _UNREADABLE = (SerdeError, IndexError, OverflowError)
 
 
@@ -222,6 +224,26 @@ def decode(record_type: type, data: bytes | memoryview, definition: Definition =
         BagError: the definition is neither ours nor an older one of ours.
         RecordError: the bytes are no such message, or its lengths disagree.
     """
+    return decode_sent(record_type, data, definition)[0]
+
+
+def decode_sent(
+    record_type: type, data: bytes | memoryview, definition: Definition = OWN
+) -> tuple[Record, str]:
+    """The record in the CDR bytes of its message, and who sent it.
+
+    Args:
+        record_type: its kind.
+        data: the bytes.
+        definition: that of the bag, by which the bytes are read; by default that of this version.
+
+    Returns:
+        The record, and the instance id of the process that published it; empty if not stated.
+
+    Raises:
+        BagError: the definition is neither ours nor an older one of ours.
+        RecordError: the bytes are no such message, or its lengths disagree.
+    """
     name = type_name(record_type)
     store, conversions = _reading(name, definition)
     try:
@@ -229,7 +251,7 @@ def decode(record_type: type, data: bytes | memoryview, definition: Definition =
     except _UNREADABLE as error:
         raise RecordError(f'{record_type.__name__} cannot be decoded: {error}') from error
     values = {field: inward(getattr(message, field)) for field, inward in conversions}
-    return record_of(record_type, values)
+    return record_of(record_type, values), getattr(message, 'sender', '')
 
 
 def stamp_of(data: bytes) -> int:
@@ -242,13 +264,16 @@ def stamp_of(data: bytes) -> int:
     return int(seconds * 10**9 + nanoseconds)
 
 
-def encode(record: Record, stamp: int = 0, definition: Definition = OWN) -> bytes:
+def encode(
+    record: Record, stamp: int = 0, definition: Definition = OWN, sender: str = ''
+) -> bytes:
     """The CDR bytes of a record's message.
 
     Args:
         record: the content of the message.
         stamp: when it is published [ns].
         definition: that of the bag for which they are; by default that of this version.
+        sender: instance id of the process that publishes it. The message is not signed.
 
     Raises:
         BagError: the definition is neither ours nor an older one of ours.
@@ -256,14 +281,15 @@ def encode(record: Record, stamp: int = 0, definition: Definition = OWN) -> byte
     """
     name = type_name(type(record))
     store, _ = _reading(name, definition)
-    values = [store.types['builtin_interfaces/msg/Time'](*divmod(stamp, 10**9))]
+    values: list[Any] = [store.types['builtin_interfaces/msg/Time'](*divmod(stamp, 10**9))]
+    of_message = {'sender': sender, 'signature': np.zeros(SIGNATURE_BYTES, np.uint8)}
     for field, node in store.fielddefs[name][1][1:]:
-        value = getattr(record, field)
+        value = of_message[field] if field in of_message else getattr(record, field)
         if isinstance(value, tuple):
             value = list(value)
         elif isinstance(value, bytes):
             value = np.frombuffer(value, np.uint8)
-        elif isinstance(value, np.ndarray):
+        elif isinstance(value, np.ndarray) and field not in of_message:
             element: Any = node[1][0]
             value = np.ascontiguousarray(value, element[1][0]).reshape(-1)
         values.append(value)

@@ -20,6 +20,7 @@ from codetr_ros.cli.outcome import Outcome
 from codetr_ros.cli.terminal import console
 from codetr_ros.cli.train_flags import FLAGS, PEER_DEADLINE, wrong
 from codetr_ros.config import Settings, SettingsError
+from codetr_ros.nodes import signing
 from codetr_ros.processes import launcher
 from codetr_ros.processes.launcher import LaunchError
 from codetr_ros.processes.openmp import crowded, threading_environment
@@ -311,6 +312,7 @@ def _over_topics(
         robot=topics.robot,
     )
     watch = _watcher(settings)
+    environment = launcher.environment(settings) | signing.environment()
     silence, summary, progress = Silence(), audience.summary, audience.progress
 
     def receive(record: Record) -> None:
@@ -322,13 +324,13 @@ def _over_topics(
     with launcher.Processes(progress.log, asked, start_program=topics.start) as processes:
         try:
             # The watcher comes first, so as to receive everything from the nodes' start on.
-            with watch(receive, namespace) as watcher:
+            with watch(receive, namespace, key=signing.key_of(environment)) as watcher:
 
                 def poll() -> None:
                     watcher.poll(0.1)
                     audience.tick()
 
-                processes.start(commands, folder / run_folder.LOGS, launcher.environment(settings))
+                processes.start(commands, folder / run_folder.LOGS, environment)
                 failure = supervise(
                     processes,
                     poll,

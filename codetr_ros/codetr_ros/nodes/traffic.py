@@ -3,11 +3,13 @@
 import time
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Protocol
 
-from codetr_ros.bags.definitions import decode
+from codetr_ros.bags.definitions import decode_sent
 from codetr_ros.config import Settings
 from codetr_ros.cores.core import Core, Silent
+from codetr_ros.nodes.admission import Admission, Unknown
 from codetr_ros.nodes.peers import Ledger
 from codetr_ros.records import (
     TOPICS,
@@ -21,10 +23,14 @@ from codetr_ros.records import (
     Transitions,
     describe,
 )
-from codetr_ros.records.bounds import check_bounds
+from codetr_ros.records.bounds import LONGEST_NAME, check_bounds
 from codetr_ros.records.checks import check_phase
 from codetr_ros.records.shown import LONGEST_LINE, shown, worth_a_line
 
+KEPT_BYTES = 16 << 20
+"""The most bytes that are kept of messages whose senders wait for their place."""
+KEPT_SECONDS = 10.0
+"""How long they are kept."""
 PHASED = (Policy, Transitions, Commit, StepRewards)
 """Kinds of records of a phase that must have been permitted."""
 LATE_COMMITS = 16
@@ -32,8 +38,8 @@ MOST_HELD = 4096
 """Records that are held back while a node joins."""
 
 
-def arrived(kind: type, data: bytes) -> Record:
-    """The record in the bytes of a message from anywhere.
+def arrived(kind: type, data: bytes) -> tuple[Record, str]:
+    """The record in the bytes of a message from anywhere, and who sent it.
 
     Args:
         kind: what its topic carries.
@@ -43,9 +49,30 @@ def arrived(kind: type, data: bytes) -> Record:
         RecordError: the bytes are no such message, its lengths disagree, or a name, size or count
             in it is beyond all bounds.
     """
-    record = decode(kind, data)
+    record, sender = decode_sent(kind, data)
+    if len(sender) > LONGEST_NAME or not sender.isprintable():
+        raise RecordError(
+            f'{kind.__name__}.sender is {shown(repr(sender))}: it must be at most {LONGEST_NAME} '
+            'printable characters'
+        )
     check_bounds(record)
-    return record
+    return record, sender
+
+
+Again = Callable[[type, bytes], None]
+"""Takes the bytes of a message of a kind."""
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """A message whose sender waits for its place."""
+
+    sender: str
+    at: float  # monotonic time [s]
+    kind: type
+    data: bytes
+    again: Again
+    error: RecordError  # why it is refused in the end
 
 
 class Taker(Protocol):
@@ -70,6 +97,7 @@ class Traffic:
         core: takes the records; a silent one until the node has joined.
         settings: those of the run, once it is known.
         run_id: the run, once it is known.
+        admission: decides whose messages are taken.
         received: messages of this run that arrived, sound or not.
         refused: those of them that were refused.
         recovered: records that were lost, and arrived when fetched again.
@@ -79,14 +107,22 @@ class Traffic:
     Args:
         log: the node's logger.
         clock: monotonic time [s].
+        admission: decides whose messages are taken; None: of whoever has joined.
     """
 
-    def __init__(self, log: Any, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        log: Any,
+        clock: Callable[[], float] = time.monotonic,
+        admission: Admission | None = None,
+    ) -> None:
         self._log = log
         self._clock = clock
         self.core: Core[Any] = Silent()
         self.settings: Settings | None = None
         self.run_id = ''
+        self.admission = admission or Admission(TOPICS.__getitem__, None, lambda: 0.0)
+        self._kept: list[_Kept] = []
         self.received: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
         self.recovered: Counter[str] = Counter()
@@ -115,20 +151,63 @@ class Traffic:
         self._held.append(record)
         return True
 
-    def decode(self, kind: type, data: bytes) -> Record | None:
-        """The record in a message that arrived; None if it must be refused, which is counted."""
+    def decode(self, kind: type, data: bytes, again: Again | None = None) -> Record | None:
+        """The record in a message that arrived; None if it is refused, which is counted, or kept
+        until its sender has its place.
+
+        Args:
+            kind: what its topic carries.
+            data: CDR.
+            again: takes the message again, once its sender has its place; None: it is not kept.
+        """
+        try:
+            self.admission.check_signature(kind, data)
+        except RecordError as error:  # nothing that counts for anything
+            self.refuse(kind, error)
+            return None
+        now = self._clock()
         ours = kind not in (Presence, RunSpec)  # of which nothing is missed
         try:
-            record = arrived(kind, data)
+            record, sender = arrived(kind, data)
             # what is of another run must not stand in for what is lost of this one
             ours = ours and self.run_id in ('', record.run_id)
-            return record
+            self.admission.admit(record, sender, data, now)
+        except Unknown as error:
+            ours = False
+            if again is None or not self._keep(_Kept(sender, now, kind, data, again, error)):
+                self.refuse(kind, error)
+            return None
         except RecordError as error:
             self.refuse(kind, error)
             return None
         finally:
             if ours:
                 self.received[TOPICS[kind]] += 1  # sound or not, it is not lost
+        if kind is Presence:
+            self._take_kept(sender)
+        return record
+
+    def _keep(self, message: '_Kept') -> bool:
+        held = sum(len(each.data) for each in self._kept)
+        if message.kind is Presence or held + len(message.data) > KEPT_BYTES:
+            return False
+        self._kept.append(message)
+        return True
+
+    def _take_kept(self, sender: str) -> None:
+        """Take what a process published before it got its place."""
+        mine = [each for each in self._kept if each.sender == sender]
+        self._kept = [each for each in self._kept if each.sender != sender]
+        for each in mine:
+            each.again(each.kind, each.data)
+
+    def expire(self) -> None:
+        """Refuse what was kept for a sender that got no place in time."""
+        due = self._clock() - KEPT_SECONDS
+        late = [each for each in self._kept if each.at < due]
+        self._kept = [each for each in self._kept if each.at >= due]
+        for each in late:
+            self.refuse(each.kind, each.error)
 
     def receive(self, record: Record, taker: Taker | None = None) -> bool:
         """Hand a record to the core, or to another taker; returns whether it was new and taken."""
@@ -152,10 +231,21 @@ class Traffic:
         late = LATE_COMMITS if isinstance(record, Commit) else 0
         check_phase(record, due + late, settings)
 
+    def fetched(self, kind: type, data: bytes) -> Record:
+        """The record in a message that was fetched again.
+
+        Raises:
+            RecordError: it is no message, is not signed, or its sender may not publish it.
+        """
+        self.admission.check_signature(kind, data)
+        record, sender = arrived(kind, data)
+        self.admission.check_again(record, sender)
+        return record
+
     def take_again(self, kind: type, data: bytes) -> None:
         """Take the bytes of a message that was fetched again."""
         try:
-            self.receive_again(arrived(kind, data))
+            self.receive_again(self.fetched(kind, data))
         except RecordError as error:
             self.refuse(kind, error)
 

@@ -1,8 +1,8 @@
 """The kinds of records: one frozen dataclass for each message of `codetr_msgs`.
 
 A record has the fields of its message, with the same names, in the same order (the message adds a
-`stamp`, from which nothing learns). Records know nothing of ROS; `codetr_ros.ros.messages` turns
-one into the other. Fields are given by name: many neighbours have one type, and two that changed
+`stamp`, from which nothing learns, its sender and a signature). Records know nothing of ROS;
+`codetr_ros.bags.definitions` turns one into the other. Fields are given by name: many neighbours have one type, and two that changed
 places would go unnoticed. Arrays are numpy; their shapes use T = steps, O = observation size,
 A = action size.
 """

@@ -19,10 +19,12 @@ from rclpy.publisher import Publisher
 
 from codetr_ros.bags.definitions import encode
 from codetr_ros.config import Settings
+from codetr_ros.nodes.signing import key_of, signed
 from codetr_ros.records import TOPICS, Record
 from codetr_ros.records.shown import shown, worth_a_line
 from codetr_ros.ros import messages, qos
 from codetr_ros.ros.plots import Plots
+from codetr_ros.ros.signing import new_instance
 
 UNDECODABLE = (rclpy_implementation.RCLError, rclpy_implementation.RMWError, UnicodeDecodeError)
 """What the executor raises for a request, or an answer, that is none. Callbacks of ours only store
@@ -35,15 +37,23 @@ RECORDS_OF_TOPIC = {topic: record_type for record_type, topic in TOPICS.items()}
 class Link:
     """Publishes records and holds the messages that arrived.
 
+    Attributes:
+        instance: id of this start of the node, the sender of all its messages.
+        key: with which they are signed; None: not at all.
+
     Args:
         name: the node's name unless it is remapped.
     """
 
     def __init__(self, name: str) -> None:
         self.node = Node(name)
+        self.instance = new_instance()
+        self.key = key_of()
+        self._stamp = 0  # of the newest message [ns]
         self._executor = EventsExecutor()
         self._executor.add_node(self.node)
         self._publishers: dict[str, Publisher] = {}
+        self._topics: dict[type, str] = {}
         self._diagnostics = self.node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._plots = Plots(self.node)
         self._events = 0
@@ -117,8 +127,21 @@ class Link:
         self._plots.publish(record)
 
     def message(self, record: Record) -> bytes:
-        """The bytes of a record's message, stamped with the present time."""
-        return encode(record, self.node.get_clock().now().nanoseconds)
+        """The bytes of a record's message, stamped with the present time, and signed if the run
+        has a key. No two stamps are the same, and none is before another, even if the clock is set
+        back: receivers refuse what is older than what they have.
+        """
+        self._stamp = max(self.node.get_clock().now().nanoseconds, self._stamp + 1)
+        data = encode(record, self._stamp, sender=self.instance)
+        if self.key is None:
+            return data
+        return signed(self.key, self.topic(type(record)), data)
+
+    def topic(self, record_type: type) -> str:
+        """The full name of the topic of a kind of record."""
+        if record_type not in self._topics:
+            self._topics[record_type] = self.node.resolve_topic_name(TOPICS[record_type])
+        return self._topics[record_type]
 
     def send(self, topic: str, data: bytes) -> None:
         """Publish the bytes of a message, and count it."""

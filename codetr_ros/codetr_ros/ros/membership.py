@@ -1,7 +1,6 @@
 """A node's place in a run: its identity, its run and the other nodes."""
 
 import hashlib
-import secrets
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -12,6 +11,7 @@ import numpy as np
 
 from codetr_ros.config import Settings, SettingsError, from_canonical
 from codetr_ros.cores.core import Core
+from codetr_ros.nodes.admission import Admission
 from codetr_ros.nodes.errors import NodeError
 from codetr_ros.nodes.outbox import Outbox
 from codetr_ros.nodes.patience import Limit, Patience
@@ -37,7 +37,6 @@ from codetr_ros.ros.link import Link
 from codetr_ros.ros.resend import serve_outbox
 from codetr_ros.ros.signals import Stop
 from codetr_ros.system.files import FileError, check_makeable
-from codetr_ros.system.liveness import own_name
 
 KEPT_PHASES = 6
 """Phases, beside those that may be under way, of which a node keeps what it has published: as far
@@ -91,7 +90,8 @@ class Membership:
         self.link = Link(name)
         self.log = self.link.node.get_logger()
         self.peers = Peers(role)
-        self.traffic = Traffic(self.log)
+        admission = Admission(self.link.topic, self.link.key, self._silence)
+        self.traffic = Traffic(self.log, admission=admission)
         self.company: list[Membership] = []
         self.values: dict[str, Any] = {}
         self.run: RunSpec | None = None
@@ -101,7 +101,6 @@ class Membership:
         self.doing = 'starting'
         self.deadline_is, self.again = Limit.setting, Limit.again
         self.waits_since: float | None = None
-        self._instance = f'{secrets.token_hex(8)} {own_name()}'.rstrip()
         self._serves = False  # the core is made from the run's settings
         self._fetcher: Fetcher | None = None
         self._outbox: Outbox | None = None
@@ -122,6 +121,10 @@ class Membership:
     def deadline(self) -> float:
         """Seconds to wait for peers; 0: for ever."""
         return float(self.values['peer_deadline'])
+
+    def _silence(self) -> float:
+        """Seconds of silence after which the place of a peer is free; 0: never."""
+        return float(self.values.get('peer_deadline', 0.0))
 
     @property
     def limit(self) -> Limit:
@@ -177,6 +180,7 @@ class Membership:
             settings: those of the run, which bound what is handed over.
         """
         self.traffic.core, self.traffic.settings = core, settings
+        self.traffic.admission.settings = settings
         self._serves = True
         if self.run is not None:
             self.traffic.run_id = self.run.run_id
@@ -225,6 +229,7 @@ class Membership:
             wait: seconds to block for something to arrive, if nothing has.
         """
         self.link.handle(wait)
+        self.traffic.expire()
         if time.monotonic() - self._presence_at >= PRESENCE_EVERY:
             self.publish_presence()
         if self._fetcher is not None and self.begun:
@@ -236,7 +241,7 @@ class Membership:
 
     def take(self, kind: type, data: bytes) -> None:
         """Take the bytes of a message of any kind that arrived."""
-        record = self.traffic.decode(kind, data)
+        record = self.traffic.decode(kind, data, self.take)
         if record is None:
             return
         try:
@@ -304,7 +309,7 @@ class Membership:
         self.run, self.announcement = spec, data
 
     def _note_peer(self, presence: Presence) -> None:
-        if presence.instance_id == self._instance:
+        if presence.instance_id == self.link.instance:
             return
         own = self.run.run_id if self.run else ''
         if own and presence.run_id not in ('', own):
@@ -351,7 +356,7 @@ class Membership:
                 run_id=self.run.run_id if self.run else '',
                 role=self.role,
                 node=self.link.full_name,
-                instance_id=self._instance,
+                instance_id=self.link.instance,
                 settings_hash=self.run.settings_hash if self.run and self._serves else '',
                 finished=finished,
                 topics=topics,

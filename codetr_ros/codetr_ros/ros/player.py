@@ -4,8 +4,8 @@ Every role of the run that is not live is played, under its own node name, since
 their peers by role and name. The recorder is always played: this is its main loop, and it sends a
 phase again to a node that lacks it. So are the simulators, and the learner, reward node and
 evaluator where they are not live. Messages of the recorded nodes of live roles are not played. The
-messages go out as the bytes that were recorded. Only if a live learner announces a run of its own
-are they written anew, under its id.
+records go out in messages of the played nodes, signed if the environment has the key of a run. If
+a live learner announces a run of its own, they go out under its id.
 """
 
 import sys
@@ -149,10 +149,10 @@ class Playing(PlayedWiring):
         if link is None:
             self.left += 1
             return
-        topic, data = TOPICS[type(record)], given.data
+        topic = TOPICS[type(record)]
         if record.run_id != self.joined.run.run_id:
-            record, data = replace(record, run_id=self.joined.run.run_id), b''
-        data = data or link.message(record)
+            record = replace(record, run_id=self.joined.run.run_id)
+        data = link.message(record)  # from the played node, and signed as it signs
         if isinstance(record, Commit):
             self._last.commit(record, data)
             self._log_phase(record)

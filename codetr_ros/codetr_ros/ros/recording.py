@@ -17,13 +17,12 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any, cast
 
-from codetr_ros.bags.definitions import encode, stamp_of
+from codetr_ros.bags.definitions import decode_sent, encode, stamp_of
 from codetr_ros.bags.topics import topics_of_run
 from codetr_ros.cores.beside import Beside, Early
 from codetr_ros.cores.recorder import Recorder
 from codetr_ros.nodes.kept_run import KeptRun
 from codetr_ros.nodes.settling import Settling
-from codetr_ros.nodes.traffic import arrived
 from codetr_ros.records import (
     TOPICS,
     Commit,
@@ -136,14 +135,14 @@ class Recording(Wiring):
 
     def take(self, kind: type, raw: bytes) -> None:
         """Take the bytes of a message: what is admitted is written as it came."""
-        record = self.member.traffic.decode(kind, raw)
+        record = self.member.traffic.decode(kind, raw, self.take)
         if record is not None and not self._bag.closed:  # else others may still publish
             self._take(record, raw)
 
     def _take_again(self, kind: type, raw: bytes) -> bool:
         """Take the bytes of a message that was sent again; returns whether it was new."""
         try:
-            new = self._take(arrived(kind, raw), raw)
+            new = self._take(self.member.traffic.fetched(kind, raw), raw)
         except RecordError as error:
             self.member.traffic.refuse(kind, error)
             return False
@@ -152,7 +151,7 @@ class Recording(Wiring):
 
     def _knows(self, kind: type, raw: bytes) -> bool:
         try:
-            return self._bag.repeats.knows(arrived(kind, raw))
+            return self._bag.repeats.knows(self.member.traffic.fetched(kind, raw))
         except RecordError:
             return True  # nothing is to be had from it
 
@@ -202,7 +201,9 @@ class Recording(Wiring):
         if not isinstance(record, StepRewards):
             return raw
         kept = cast(Recorder, self.joined.core).kept(record)
-        return raw if kept is record else encode(kept, stamp_of(raw))
+        if kept is record:
+            return raw
+        return encode(kept, stamp_of(raw), sender=decode_sent(StepRewards, raw)[1])
 
     def _write(self, record: Record, raw: bytes, published: int | None = None) -> None:
         now = self.member.link.node.get_clock().now().nanoseconds

@@ -14,6 +14,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
+from codetr_ros.nodes.signing import is_signed
 from codetr_ros.nodes.traffic import arrived
 from codetr_ros.records import (
     TOPICS,
@@ -44,11 +45,18 @@ class Watcher:
         on_record: called by `poll`, in the thread that polls.
         namespace: namespace of the run, such as '/run_1'.
         name: node name.
+        key: that of the run, with which all that is handed over must be signed; None: it need not.
     """
 
     def __init__(
-        self, on_record: Callable[[Record], None], namespace: str, name: str = 'watch'
+        self,
+        on_record: Callable[[Record], None],
+        namespace: str,
+        name: str = 'watch',
+        key: bytes | None = None,
     ) -> None:
+        self._key = key
+        self._topics: dict[type, str] = {}
         self._on_record = on_record
         self._namespace = namespace
         self._name = name
@@ -68,6 +76,7 @@ class Watcher:
         self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self._node)
         for kind in WATCHED:
+            self._topics[kind] = self._node.resolve_topic_name(TOPICS[kind])
             durable = qos.QUALITIES[TOPICS[kind]].transient_local
             self._node.create_subscription(
                 messages.message_type(kind),
@@ -108,7 +117,9 @@ class Watcher:
         came, self._inbox = self._inbox, []
         for kind, data in came:
             try:
-                record = arrived(kind, data)
+                if self._key and not is_signed(self._key, self._topics[kind], data):
+                    raise RecordError('not signed with the key of the run')
+                record, _ = arrived(kind, data)
             except RecordError:
                 self.refused += 1
                 continue
