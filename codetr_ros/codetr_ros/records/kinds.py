@@ -3,8 +3,8 @@
 A record has the fields of its message, with the same names, in the same order (the message adds a
 `stamp`, from which nothing learns, its sender and a signature). Records know nothing of ROS;
 `codetr_ros.bags.definitions` turns one into the other. Fields are given by name: many neighbours
-have one type, and two that changed places would go unnoticed. Arrays are numpy; their shapes use T = steps, O = observation size,
-A = action size.
+have one type, and two that changed places would go unnoticed. Arrays are numpy; their shapes use
+T = steps, O = observation size, A = action size.
 """
 
 from collections.abc import Mapping
