@@ -214,20 +214,7 @@ class Witness:
 
     def say(self, *records: Record) -> None:
         """Publish records as if this were a node of the run, once all readers are matched."""
-        self.say_bytes(*((type(record), self._as_of_the_run(record)) for record in records))
-
-    def _as_of_the_run(self, record: Record) -> bytes:
-        """The message of a record, with the name of the process that may publish it as its sender,
-        which without a key anybody can claim to be.
-        """
-        role = {'policy': 'learner'}.get(TOPICS[type(record)], 'sim')
-        scored = isinstance(record, CompositeReward) and record.scorer != record.source
-        own = self.link.instance
-        self.link.instance = own if scored else self.presence[role].instance_id
-        try:
-            return self.link.message(record)
-        finally:
-            self.link.instance = own
+        self.say_bytes(*((type(record), self.link.message(record)) for record in records))
 
     def say_bytes(self, *said: tuple[type, bytes]) -> None:
         """Publish bytes on the topics of kinds of records, once all readers are matched."""
