@@ -109,9 +109,10 @@ def test_every_message_file_is_built():
 @pytest.mark.parametrize('record', get_args(records.Record), ids=lambda record: record.__name__)
 def test_a_record_and_its_message_have_the_same_fields_in_the_same_order(record: type):
     lines = (ROOT / 'msgs' / 'msg' / f'{record.__name__}.msg').read_text().splitlines()
-    declared = [re.match(r'([\w/]+(?:\[\])?) (\w+)(=?)', line) for line in lines]
+    declared = [re.match(r'([\w/]+(?:\[\d*\])?) (\w+)(=?)', line) for line in lines]
     names = [found[2] for found in declared if found and not found[3]]
-    assert names == ['stamp', *(field.name for field in fields(record))]
+    own = [field.name for field in fields(record)]
+    assert names == ['stamp', *own, 'sender', 'signature']
 
 
 def test_every_field_of_every_message_says_what_it_is():
