@@ -14,7 +14,7 @@ from helpers.builders import commit, policy, run, score, task_spec, tiny, transi
 from helpers.cores import slices
 
 BOTH = ('sim', 'sim_2')
-SETTINGS = tiny(simulators=2, steps=40, phase_steps=10, warmup_steps=10)
+SETTINGS = tiny(simulators=2, steps=40, phase_steps=10, warmup_steps=40)
 VOIDED = SETTINGS.lag * 10  # no more records than that are under way
 
 
@@ -111,24 +111,32 @@ def test_a_recorder_that_goes_on_with_its_bag_drops_what_was_dropped():
 
 
 def test_consumers_take_in_nothing_of_a_source_that_was_left_out_however_late_it_comes():
+    made, work = recorder()
     intake = Intake(run(SETTINGS), SETTINGS, scores=True)
     for name in BOTH:
         intake.receive(task_spec(source=name))
     memory = Trajectories(3, 2, SETTINGS.delay, 100, 100)
-    intake.receive(whole())
-    intake.receive(transitions(source='sim_2', steps=3))
-    last = voided(SETTINGS, 1)
-    numbers = np.array([0, last], np.int64)
-    intake.receive(commit(sources=BOTH, transitions=numbers, dropped=('sim_2',)))
+    made.receive(permission())
+    for record in (whole(), transitions(source='sim_2', steps=3)):
+        made.receive(record)
+        intake.receive(record)
+    made.leave_out(['sim_2'])
+    (first,) = commits(work)
+    intake.receive(first)
     assert intake.take(0, memory)
     assert memory.steps == 5
     assert intake.dropped == {'steps dropped': 3}
     intake.receive(transitions(source='sim_2', sequence=1, first_step=3, steps=2))
     assert intake.duplicated == {'transitions': 1}
-    intake.receive(whole('sim_2', last + 1, 1))
-    intake.receive(commit(phase=1, sources=('sim_2',), transitions=np.array([last + 1], np.int64)))
+    made.receive(permission(1))
+    last = voided(SETTINGS, 1)
+    for record in (whole(sequence=1, phase=1, episode=1), whole('sim_2', last + 1, 1)):
+        made.receive(record)
+        intake.receive(record)
+    (second,) = commits(work)
+    intake.receive(second)
     assert intake.take(1, memory)
-    assert memory.steps == 10
+    assert memory.steps == 15
 
 
 def permitted(core, work):
@@ -136,18 +144,29 @@ def permitted(core, work):
 
 
 def test_the_learner_permits_a_source_nothing_until_it_has_announced_itself_again():
-    core = Learner(run(SETTINGS), SETTINGS.changed({'warmup_steps': 40}), 'learner', None)
+    made, commits_of = recorder()
+    core = Learner(run(SETTINGS), SETTINGS, 'learner', None)
     for name in BOTH:
         core.receive(task_spec(source=name))
     work = core.work()
-    assert [p.steps.tolist() for p in permitted(core, work)] == [[5, 5]]
-    core.receive(whole())
-    core.receive(commit(sources=BOTH, transitions=np.array([0, 30], np.int64), dropped=('sim_2',)))
-    assert [p.steps.tolist() for p in permitted(core, work)] == [[5, 0]]
+
+    def roll_out(*chunks):
+        for chunk in chunks:
+            made.receive(chunk)
+            core.receive(chunk)
+        made.leave_out(['sim_2'])
+        for each in commits(commits_of):
+            core.receive(each)
+        (permit,) = permitted(core, work)
+        made.receive(permit)
+        return permit.steps.tolist()
+
+    (first,) = permitted(core, work)
+    made.receive(first)
+    assert first.steps.tolist() == [5, 5]
+    assert roll_out(whole()) == [5, 0]
     core.receive(task_spec(source='sim_2'))
-    core.receive(whole(sequence=1, phase=1, episode=1))
-    core.receive(commit(phase=1, transitions=np.array([1], np.int64)))
-    assert [p.steps.tolist() for p in permitted(core, work)] == [[5, 5]]
+    assert roll_out(whole(sequence=1, phase=1, episode=1)) == [5, 5]
 
 
 def simulator(name='sim_2'):

@@ -84,6 +84,10 @@ def test_a_request_may_name_a_source_for_each_segment_and_a_node_may_wait_for_ma
         check_bounds(replace(PRESENCE, doing='x' * 4097))
 
 
+def test_two_scorers_of_whom_a_commit_names_nothing_new_have_the_same_digest():
+    check_bounds(commit(score_digests=('e3b0', 'e3b0'), scorers=('a', 'b')))
+
+
 def test_what_is_shown_is_neither_endless_nor_able_to_forge_a_line():
     assert shown('Reacher-v5') == 'Reacher-v5'
     assert shown('ü\x1b[31m\nINFO') == r'ü\x1b[31m\nINFO'

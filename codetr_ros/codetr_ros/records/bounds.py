@@ -112,7 +112,9 @@ def _check_text(kind: type, name: str, text: str, most: int = LONGEST_NAME) -> N
 def _check_list(kind: type, name: str, names: tuple[str, ...]) -> None:
     if len(names) > MOST_NAMES:
         raise _refused(kind, name, names[:3], f'at most {MOST_NAMES} names, not {len(names)}')
-    if kind not in (Metrics, ScoreRequest) and len(set(names)) != len(names):
+    # digests are equal where nothing new is named of two sources or scorers
+    unique = kind not in (Metrics, ScoreRequest) and not name.endswith('_digests')
+    if unique and len(set(names)) != len(names):
         raise _refused(kind, name, names[:10], 'names of which none comes twice')
     for each in names:
         _check_text(kind, name, each)
