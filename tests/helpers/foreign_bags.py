@@ -9,6 +9,7 @@ import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from codetr_ros.bags.definitions import SIGNATURE_BYTES
 from codetr_ros.records import TOPICS, Record
 
 MESSAGES = Path(__file__).resolve().parents[2] / 'msgs' / 'msg'
@@ -24,7 +25,7 @@ def types() -> Any:
 
 
 def message(store: Any, record: Record) -> Any:
-    """The message of a record."""
+    """The message of a record, which nobody signed."""
     values = {}
     for f in fields(record):
         value = getattr(record, f.name)
@@ -36,7 +37,10 @@ def message(store: Any, record: Record) -> Any:
             value = list(value)
         values[f.name] = value
     stamp = store.types['builtin_interfaces/msg/Time'](1, 2)
-    return store.types[f'codetr_msgs/msg/{type(record).__name__}'](stamp=stamp, **values)
+    unsigned = {'sender': '', 'signature': np.zeros(SIGNATURE_BYTES, np.uint8)}
+    return store.types[f'codetr_msgs/msg/{type(record).__name__}'](
+        stamp=stamp, **values, **unsigned
+    )
 
 
 def write(
