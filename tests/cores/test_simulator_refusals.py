@@ -31,8 +31,8 @@ def changed(record: Policy, **fields):
     ('wrong', 'message'),
     [
         (permit(1, run_id='other'), "run 'other', this is run 'run'"),
-        (permit(0), 'has run phase=0 already'),
-        (permit(2), 'has received phase=2 already'),
+        (permit(0, steps=100), 'has run phase=0 already'),
+        (permit(2, steps=100), 'has received phase=2 already'),
         (permit(-1), 'phase=-1.*this run has phases 0 to 6'),
         (permit(8), 'phase=8.*this run has phases 0 to 6'),
         (permit(1, sources=('robot',)), r"sources=\['robot'\], not 'sim'"),
@@ -58,6 +58,21 @@ def test_a_policy_that_must_not_be_followed_is_refused_and_changes_nothing(wrong
     for ours, theirs in zip(said, expected, strict=True):
         for a, b in zip(deterministic(ours), deterministic(theirs), strict=True):
             assert same(a, b)
+
+
+def test_the_same_policy_again_is_counted_and_changes_nothing():
+    """A learner that was started again publishes the same ones again."""
+    settings = tiny(task=NEVER_ENDS)
+    simulator = Simulator(run_spec(settings), settings, 'sim')
+    simulator.receive(permit(0))
+    simulator.receive(permit(0))
+    assert simulator.report().duplicated == {'policy': 1}
+    work = simulator.work()
+    assert len([next(work), next(work)]) == 2
+    assert next(work) is None
+    simulator.receive(permit(0))
+    assert next(work) is None
+    assert simulator.report().duplicated == {'policy': 2}
 
 
 def test_weights_that_are_not_finite_are_refused():

@@ -226,7 +226,7 @@ class Simulator(Part):
         counters = self._counters.copy()
         for source in self._sources:
             counters.update(source.counters)
-        return CoreReport(lost={}, duplicated={}, counters=dict(counters))
+        return CoreReport(lost={}, duplicated=dict(self.duplicated), counters=dict(counters))
 
 
 def _content(policy: Policy) -> tuple[int, bytes, bytes]:

@@ -49,6 +49,11 @@ class Repeats:
         key = type(record), identity(record)
         return key in self._known or key in self._evaluations
 
+    def differs(self, record: Record) -> bool:
+        """Whether another record came before in its place."""
+        before = self._known.get((type(record), identity(record)))
+        return before is not None and before != _digest(record)
+
 
 def _digest(record: Record) -> bytes:
     """Of what a record says."""

@@ -27,6 +27,7 @@ from codetr_ros.records import (
     TOPICS,
     Commit,
     CompositeReward,
+    Policy,
     Preference,
     Presence,
     Record,
@@ -186,11 +187,15 @@ class Recording(Wiring):
 
     def _came_before(self, record: Record) -> bool:
         """Whether a record came before, and is neither of those whose number the core checks nor
-        labels, of which the bag may hold less than came.
+        labels, of which the bag may hold less than came. The core refuses another policy for a
+        phase that is permitted already.
         """
         if isinstance(record, (Transitions, *JUDGEMENTS, StepRewards)):
             return False
         if not self._bag.repeats.knows(record):
+            return False
+        permits = isinstance(record, Policy) and not self.joined.settings.free
+        if permits and self._bag.repeats.differs(record):
             return False
         self._bag.repeats.note(record)  # which compares them
         self.joined.core.duplicated[TOPICS[type(record)]] += 1
