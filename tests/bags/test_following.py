@@ -53,7 +53,7 @@ def test_what_has_come_is_read_once_wherever_the_writer_was_cut_off(whole: Path,
 
 
 def test_a_bag_of_several_files_is_followed_into_the_next_one(tmp_path: Path):
-    whole = ours(tmp_path / 'bag', a_run(30), chunk_bytes=2000, split_bytes=150_000)
+    whole = ours(tmp_path / 'bag', a_run(30), chunk_bytes=2000, split_bytes=220_000)
     assert len(list(whole.glob('*.mcap'))) == 2
     live = tmp_path / 'live'
     live.mkdir()

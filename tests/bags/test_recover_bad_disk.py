@@ -54,7 +54,7 @@ def bad_disk(monkeypatch):
 def test_a_split_that_the_disk_does_not_give_costs_itself_and_the_exit_code(
     lost, tmp_path, bad_disk, capsys
 ):
-    bag = ours(tmp_path / 'bag', a_run(phases=40), split_bytes=48_000)
+    bag = ours(tmp_path / 'bag', a_run(phases=40), split_bytes=130_000)
     files = Bag(bag).files
     path = files[lost]
     whole = [(m.place.file, bytes(m.data)) for m in Bag(bag).raw()]
@@ -79,7 +79,7 @@ def test_a_bad_sector_costs_the_chunks_it_lies_in_and_at_most_as_much_again(
     places = [entry.place.offset for entry in Bag(bag).entries()]
     whole = messages(bag)
     starts = sorted(set(places))
-    chunk = starts[len(starts) // 2]
+    chunk = starts[len(starts) * 2 // 3]  # definitions, which come again at times, are not near
     bad = range(chunk + 700, chunk + 700 + length)
     bad_disk(path, bad)
     found = recover(bag, tmp_path / 'new')
