@@ -104,7 +104,7 @@ def test_what_comes_twice_stays_there_twice(tmp_path):
 
 @pytest.mark.slow
 def test_a_missing_split_is_said_and_the_others_are_kept(tmp_path):
-    bag = ours(tmp_path / 'bag', a_run(phases=40), split_bytes=48_000)
+    bag = ours(tmp_path / 'bag', a_run(phases=40), split_bytes=130_000)
     (bag / 'bag_1.mcap').unlink()
     found = recover(bag, tmp_path / 'new')
     assert 'lacks bag_1.mcap' in found.losses[0].text
@@ -271,7 +271,7 @@ def test_damaged_chunks_at_the_beginning_cost_no_more_than_as_much_again(tmp_pat
 
 @pytest.mark.slow
 def test_a_split_that_is_no_file_costs_only_itself(tmp_path):
-    bag = ours(tmp_path / 'bag', a_run(phases=40), split_bytes=48_000)
+    bag = ours(tmp_path / 'bag', a_run(phases=40), split_bytes=130_000)
     last = Bag(bag).files[-1]
     last.unlink()
     last.mkdir()
@@ -281,7 +281,7 @@ def test_a_split_that_is_no_file_costs_only_itself(tmp_path):
 
 @pytest.mark.slow
 def test_a_last_split_that_is_missing_is_a_loss(tmp_path, capsys):
-    bag = ours(tmp_path / 'bag', a_run(phases=40), split_bytes=48_000)
+    bag = ours(tmp_path / 'bag', a_run(phases=40), split_bytes=130_000)
     last = Bag(bag).files[-1]
     last.unlink()
     assert main(['bag', 'recover', str(bag), '--out', str(tmp_path / 'new')]) == 1
