@@ -7,8 +7,13 @@ from codetr_ros import cli
 
 def test_without_a_name_the_examples_are_listed(capsys):
     assert cli.main(['demo']) == 2
-    assert 'a robot in real time' in capsys.readouterr().out
-    assert cli.main(['demo', '--help']) == 0
+    refused = capsys.readouterr()
+    assert 'a robot in real time' in refused.err
+    assert refused.out == ''
+    with pytest.raises(SystemExit) as left:
+        cli.main(['demo', '--help'])
+    assert left.value.code == 0
+    assert capsys.readouterr().out == refused.err
 
 
 def test_an_unknown_example_is_refused_with_the_one_that_is_close(capsys):
