@@ -1,6 +1,7 @@
 """The film strip of a run's report."""
 
 import base64
+import functools
 import io
 import os
 import subprocess
@@ -34,6 +35,8 @@ SETTINGS = config.load('quick').changed(
         'sac.batch': 8,
     }
 )
+PATIENCE = 300.0
+"""Seconds for a film of two, where a busy machine draws: the frames are tested, not the time."""
 DRAWS = (
     'import sys, pathlib\n'
     "pathlib.Path(sys.argv[1], 'film.png').write_bytes(b'drawn')\n"
@@ -80,7 +83,7 @@ def test_a_film_shows_the_episodes_of_the_runs_own_evaluations(
     (middle,) = [result for result in results if result.step == 200]
     assert (random.purpose, last.step) == ('random', 400)
 
-    note = film.make(run_dir, environment={**os.environ, 'MUJOCO_GL': driver})
+    note = film.make(run_dir, PATIENCE, environment={**os.environ, 'MUJOCO_GL': driver})
 
     lengths = (
         f'random policy {random.length} steps, after 200 steps {middle.length} steps, '
@@ -185,7 +188,7 @@ def test_a_run_without_a_policy_is_not_drawn_and_the_note_tells_why(
     folder = run_folder.create(tmp_path / 'run')
     run_folder.write_settings(folder, SETTINGS)
 
-    note = film.make(folder, environment={**os.environ, 'MUJOCO_GL': driver})
+    note = film.make(folder, PATIENCE, environment={**os.environ, 'MUJOCO_GL': driver})
 
     assert note.startswith('No frames of the robot: ')
     assert 'holds no checkpoint of the learner' in note
@@ -198,6 +201,7 @@ def test_train_and_report_put_the_film_into_the_report(
     for name, value in os.environ.items():  # what `codetr train` sets ends with this test
         monkeypatch.setenv(name, value)
     monkeypatch.setenv('MUJOCO_GL', driver)
+    monkeypatch.setattr(film, 'make', functools.partial(film.make, deadline=PATIENCE))
     file, folder = tmp_path / 'tiny.yaml', tmp_path / 'run'
     file.write_text(yaml.safe_dump(SETTINGS.model_dump(mode='json')))
 
