@@ -121,12 +121,13 @@ class Recorder(Part):
                 self._chain.note(record)
         elif isinstance(record, Preference):
             check_preference(record, self._settings.scored_at_most)
-            check_scorer(record, self._settings)
+            # no name in `scorers` would let anybody compare there
             if not self._settings.scored_elsewhere:
                 raise RecordError(
                     f'{describe(record)} of {record.scorer!r}: the simulator scores in this run, '
                     'so nobody compares; start the run with scorer=topic'
                 )
+            check_scorer(record, self._settings)
             self._judged(record)
         elif isinstance(record, StepRewards):
             check_labels(record, self._settings)
