@@ -21,7 +21,8 @@ from codetr_ros.ros.fetch import unpack
 from codetr_ros.ros.membership import Membership
 from codetr_ros.ros.signals import Stop
 from codetr_ros.runs import folder as run_folder
-from helpers.builders import commit, policy, score, step_rewards, task_spec, tiny, transitions
+from helpers.builders import policy, score, step_rewards, task_spec, tiny, transitions
+from helpers.commits import committed
 from helpers.playing import NAMESPACE, everybody_matched, output, process
 
 
@@ -37,12 +38,24 @@ def read_by(play, *nodes):
     return not play.links['sim'].unmatched(topics, lambda _: names, readers=True)
 
 
+def waits_for_a_phase(play):
+    """Whether the reward node has joined, and lacks the first records of the run."""
+    return any('the tasks of all sources' in p.doing for p in play.presence_of('reward'))
+
+
 def publish_a_phase(play):
+    """Publish all that a phase has; returns what its commit has digests of."""
     sim, learner = play.links['sim'], play.links['learner']
+    named = (
+        policy(steps=np.array([5], np.uint32)),
+        transitions(phase_end=True, scores_due=1, terminated=True),
+        score(length=5),
+    )
     sim.publish(task_spec())
-    learner.publish(policy(steps=np.array([5], np.uint32)))
-    sim.publish(transitions(phase_end=True, scores_due=1, terminated=True))
-    sim.publish(score(length=5))
+    learner.publish(named[0])
+    for record in named[1:]:
+        sim.publish(record)
+    return named
 
 
 @pytest.mark.slow
@@ -54,7 +67,7 @@ def test_a_phase_that_a_node_lacks_is_fetched_from_the_recorder_and_the_loss_is_
         process('record') as record,
         process('deaf', f'folder:={tmp_path}', 'peer_deadline:=20.0') as deaf,
     ):
-        play.until(lambda: read_by(play, 'record', 'reward'), deaf)
+        play.until(lambda: read_by(play, 'record', 'reward') and waits_for_a_phase(play), deaf)
         publish_a_phase(play)
         labels = play.until(lambda: play.messages('StepRewards', 'learner'), deaf)[0]
         assert list(labels.lengths) == [5]
@@ -67,7 +80,7 @@ def test_a_phase_that_a_node_lacks_is_fetched_from_the_recorder_and_the_loss_is_
     report = json.loads(run_folder.report_path(tmp_path, 'reward', 'reward').read_text())
     assert report['fetched'] == {'transitions': 1}
     assert report['lost'] == {}
-    assert report['duplicated'] == {'composite_rewards': 1}
+    assert report['duplicated'] == {'composite_rewards': 1, 'commits': 1}
     missed = [presence.missed for presence in play.presence_of('reward')]
     assert missed[-1] == 0
 
@@ -76,14 +89,8 @@ def test_a_phase_that_a_node_lacks_is_fetched_from_the_recorder_and_the_loss_is_
 def test_a_node_gives_up_on_what_was_lost_for_good_naming_topic_and_count(play):
     play = play(settings=settings(), roles=('learner', 'sim', 'record'))
     with process('deaf', 'peer_deadline:=7.0') as deaf:  # and nobody offers to send anything again
-        play.until(lambda: read_by(play, 'reward'), deaf)
-        play.until(
-            lambda: [p for p in play.presence_of('reward') if 'for messages' in p.doing], deaf
-        )
-        publish_a_phase(play)
-        play.links['record'].publish(
-            commit(scores=np.zeros(1, np.int64)),
-        )
+        play.until(lambda: read_by(play, 'reward') and waits_for_a_phase(play), deaf)
+        play.links['record'].publish(committed(*publish_a_phase(play)))
         play.until(lambda: deaf.poll() is not None)
         said = output(deaf)
     assert deaf.returncode == 1

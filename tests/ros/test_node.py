@@ -14,6 +14,7 @@ from rosbags.highlevel import AnyReader
 
 from codetr_ros.bags.definitions import decode
 from codetr_ros.records import PROTOCOL_VERSION, Commit, RunSpec
+from codetr_ros.records.digests import digest
 from codetr_ros.records.roles import command
 from codetr_ros.ros.watch import Watcher
 from codetr_ros.runs import folder as run_folder
@@ -28,7 +29,7 @@ def test_a_recorder_commits_a_phase_and_keeps_every_byte_of_it(play, tmp_path):
         commit = one_phase(play)
         assert (commit.phase, list(commit.sources), list(commit.transitions)) == (0, ['sim'], [0])
         labels = np.arange(5, dtype=np.float32)
-        play.links['reward'].publish(step_rewards())
+        play.links['reward'].publish(step_rewards(commit=digest(commit)))
         play.finished = True
         play.until(lambda: node.poll() is not None)
         said = output(node)
@@ -111,6 +112,7 @@ def test_what_must_be_refused_is_counted_and_changes_nothing(play, tmp_path):
     with process('record', f'folder:={tmp_path}') as node:
         play.until(lambda: everybody_matched(play), node)
         play.links['sim'].publish(transitions(run_id='another'))
+        play.claimed = {'transitions': -1}  # that is not of this run
         one_phase(play)
         diagnostics = []
         play.links['sim'].node.create_subscription(
