@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Bool, Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
@@ -23,6 +25,7 @@ from helpers.builders import tiny
 
 EXAMPLE = Path(__file__).resolve().parents[2] / 'examples' / 'robot_arm'
 DRIVER = f'{nodes.NAMESPACE}/robot_driver'
+COMMANDS = '/arm/velocity_commands'
 
 
 def robot_settings(**changes: Any) -> Settings:
@@ -101,7 +104,7 @@ class Person(nodes.Witness):
         node = self.link.node
         node.create_subscription(
             Float64MultiArray,
-            '/arm/velocity_commands',
+            COMMANDS,
             lambda message: self.link.store(self.commands.append, list(message.data)),
             QoSProfile(depth=100),
         )
@@ -117,6 +120,20 @@ class Person(nodes.Witness):
         future = client.call_async(request)
         self.until(future.done)
         return future.result()
+
+    def activate(self) -> None:
+        """Let the robot move."""
+        change = self.link.node.create_client(ChangeState, f'{DRIVER}/change_state')
+        self.until(change.service_is_ready)
+        request = ChangeState.Request()
+        request.transition.id = Transition.TRANSITION_ACTIVATE
+        future = change.call_async(request)
+        self.until(future.done)
+        assert future.result().success
+
+    def sees_commands(self) -> bool:
+        """Whether commands would arrive here."""
+        return self.link.node.count_publishers(COMMANDS) > 0
 
     def moves(self) -> bool:
         """Whether one of the last two commands moves the arm."""
