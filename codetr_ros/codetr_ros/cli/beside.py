@@ -97,6 +97,7 @@ def pages(
     log: Callable[[str], None],
     watch: bool,
     namespace: str | None,
+    key: Mapping[str, str],
 ) -> list[Beside]:
     """The pages that are served beside a run.
 
@@ -106,10 +107,12 @@ def pages(
         log: prints a line for people.
         watch: whether somebody wants to watch the run.
         namespace: of the nodes; None: there are none.
+        key: the variable with the key of the run, without which no score is taken.
     """
     beside = [Beside(folder, log)] if watch else []
     if settings.scorer == 'person' and namespace is not None:
         name = settings.scorers[0] if settings.scorers else 'person'
         program = (*PROGRAM, 'score', namespace, '--name', name)
-        beside.append(Beside(folder, log, program, launcher.environment(settings)))
+        environment = launcher.environment(settings) | dict(key)
+        beside.append(Beside(folder, log, program, environment))
     return beside

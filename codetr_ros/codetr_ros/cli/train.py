@@ -65,6 +65,7 @@ class Topics:
         start: starts each.
         robot: parameters of the robot node, where the task is that of a robot.
         restarts: how often one that was killed is started again.
+        key: the variable with the key of the run, for all that takes part in it.
     """
 
     namespace: str | None = None
@@ -72,6 +73,7 @@ class Topics:
     start: launcher.Start = launcher.start_program
     robot: Mapping[str, str | bool] | None = None
     restarts: Restarts = dataclasses.field(default_factory=Restarts)
+    key: Mapping[str, str] = dataclasses.field(default_factory=signing.environment, repr=False)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -235,7 +237,8 @@ def train(
     events = None
     if shown.tensorboard:
         events = Events(folder / run_folder.TENSORBOARD, settings, progress.log)
-    pages = beside.pages(folder, settings, progress.log, shown.watch, namespace)
+    key = {} if topics is None else topics.key
+    pages = beside.pages(folder, settings, progress.log, shown.watch, namespace, key)
     middle = Middle(folder, settings, progress.log) if shown.film else None
     audience = Audience(summary, progress, live, events, pages, middle)
     with Interrupts() as interrupts, ExitStack() as open_pages:
@@ -312,7 +315,7 @@ def _over_topics(
         robot=topics.robot,
     )
     watch = _watcher(settings)
-    environment = launcher.environment(settings) | signing.environment()
+    environment = launcher.environment(settings) | dict(topics.key)
     silence, summary, progress = Silence(), audience.summary, audience.progress
 
     def receive(record: Record) -> None:
