@@ -25,3 +25,24 @@ class Fetching:
             return False
         self._due = now + AGAIN
         return True
+
+
+class Offered:
+    """Tells labels that were lost from those that are under way. The reward node answers as soon
+    as it has them, so that the first answer may overtake them or come right behind them.
+    """
+
+    def __init__(self) -> None:
+        self._phase: int | None = None
+        self._since = 0.0
+
+    def lost(self, phase: int, now: float) -> bool:
+        """Whether what was published of a phase should have arrived long ago.
+
+        Args:
+            phase: whose labels another node offers.
+            now: monotonic time [s].
+        """
+        if phase != self._phase:
+            self._phase, self._since = phase, now
+        return now >= self._since + AFTER

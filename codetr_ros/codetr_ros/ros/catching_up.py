@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from codetr_ros.cores.core import Core
-from codetr_ros.nodes.fetching import Fetching
+from codetr_ros.nodes.fetching import Fetching, Offered
 from codetr_ros.nodes.peers import Peers
 from codetr_ros.records import Commit, CompositeReward, Preference, StepRewards, Transitions
 from codetr_ros.records.fields import type_name
@@ -46,6 +46,7 @@ class Fetcher:
         self._recorder = Asker(link, SERVICE, run_id)
         self._reward: tuple[str, Asker] | None = None
         self._phases, self._labels = Fetching(), Fetching()
+        self._offered = Offered()
         self._kinds: tuple[type, ...] = ()  # that the core takes in
         self._fetched: Callable[[int], None]  # lets the core know that a phase was sent again
         self.behind = -1
@@ -100,5 +101,7 @@ class Fetcher:
             self._log.info(f'phase {phase}: {len(answer.messages)} messages came again')
 
     def _labelled(self, phase: int, answer: Answer) -> None:
-        if not answer.reason:  # else it has not labelled the phase yet
+        if answer.reason:
+            return  # it has not labelled the phase yet
+        if phase <= self.behind or self._offered.lost(phase, time.monotonic()):
             self._arrived('the reward node', phase, answer)
