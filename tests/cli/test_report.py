@@ -105,7 +105,8 @@ def test_nodes_that_gave_up_or_were_stopped_are_a_failure_or_an_interruption(fol
 def test_the_bag_of_a_killed_recorder_is_read_as_far_as_it_goes(folder, capsys):
     file = next((folder / run_folder.BAG).glob('*.mcap'))
     (folder / run_folder.BAG / 'metadata.yaml').unlink()
-    file.write_bytes(file.read_bytes()[: int(file.stat().st_size * 0.7)])
+    # within the records: a third or more of a bag this small are definitions, before and behind
+    file.write_bytes(file.read_bytes()[: int(file.stat().st_size * 0.51)])
 
     assert cli.main(['report', '--no-film', str(folder)]) == 0
 
