@@ -4,11 +4,12 @@ import numpy as np
 
 from codetr_ros.cores.labeller import Labeller
 from codetr_ros.memory.trajectories import Trajectories
-from codetr_ros.records import StepRewards
+from codetr_ros.records import Commit, StepRewards
 from codetr_ros.rewards.ircr import Ircr
 from helpers import builders
 from helpers.builders import ACTION as A
 from helpers.builders import OBSERVATION as O
+from helpers.commits import committed
 
 DELAY = 5
 
@@ -94,13 +95,22 @@ def test_old_segments_are_labelled_anew_in_the_phases_in_which_an_extreme_moves_
     core = Labeller(builders.run(settings), settings, 'reward', None)
     core.receive(builders.task_spec())
     work = core.work()
-    sent = []
+    sent: list[dict[int, float]] = []
+    commits: list[Commit] = []
     for phase, value in enumerate((1.0, 2.0, 1.5, 0.0)):
         where = {'sequence': phase, 'episode': phase}
-        core.receive(builders.transitions(phase=phase, truncated=True, **where))
-        core.receive(builders.score(length=DELAY, value=value, **where))
-        numbers = np.array([phase], np.int64)
-        core.receive(builders.commit(phase=phase, transitions=numbers, scores=numbers))
+        records = (
+            builders.transitions(
+                phase=phase, truncated=True, phase_end=True, scores_due=1, **where
+            ),
+            builders.score(length=DELAY, value=value, **where),
+        )
+        made = committed(
+            *records, before=commits, labels_digest=core._intake.labels.get(phase - 1, '')
+        )
+        commits.append(made)
+        for record in (*records, made):
+            core.receive(record)
         labels: dict[int, float] = {}
         while (out := next(work)) is not None:
             for part in out:

@@ -95,7 +95,7 @@ def test_networks_learn_from_preferences_alone(method):
     memory, rewards, worth = planted(300)
     changes = {f'{method}__learning_rate': 3e-3} if method not in ('rbt', 'codetr') else {}
     changes |= {'codetr__learning_rate': 1e-3, 'codetr__dropout': 0.0}
-    steps = 25 if method in ('rbt', 'codetr') else 120
+    steps = 40 if method in ('rbt', 'codetr') else 120
     made = trained(memory, steps, method=method, **changes)
     _, segments = correlations(made, memory, rewards, worth)
     assert segments > 0.5

@@ -198,9 +198,13 @@ class Fixed:
     def __init__(self, batch: SegmentBatch) -> None:
         self.batch = batch
         self.segments = self.store = self
+        self.judgements = None
 
     def sample(self, *arguments) -> SegmentBatch:
         return self.batch
+
+    def ids(self) -> np.ndarray:
+        return np.arange(len(self.batch.values))
 
     def target_scale(self, kind: str) -> float:
         return 1.5
