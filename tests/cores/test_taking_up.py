@@ -80,7 +80,12 @@ def undisturbed(tmp_path_factory):
 
 @pytest.mark.parametrize(
     ('case', 'share'),
-    [('codetr', 0.0), *zip(CASES, [0.45, 0.6, 0.75, 0.9, 0.97, 0.5], strict=True)],
+    [
+        ('codetr', 0.0),
+        # labels lie between the last commit and the one that will name them
+        ('codetr, overlap, two simulators', 0.85),
+        *zip(CASES, [0.45, 0.6, 0.75, 0.9, 0.97, 0.5], strict=True),
+    ],
 )
 def test_a_run_that_was_ended_anywhere_ends_as_an_undisturbed_one(
     case, share, undisturbed, tmp_path

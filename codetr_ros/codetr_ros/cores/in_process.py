@@ -23,7 +23,7 @@ from codetr_ros.cores.people import SimulatedPeople
 from codetr_ros.cores.recorder import Recorder
 from codetr_ros.cores.recording import RunBag
 from codetr_ros.cores.simulator import Simulator
-from codetr_ros.records import TOPICS, Record, RunSpec
+from codetr_ros.records import TOPICS, Record, RunSpec, StepRewards
 from codetr_ros.records.identity import identity
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import reports as node_reports
@@ -142,6 +142,9 @@ class Parts:
         key = type(record), identity(record)
         if key in self.repeats:
             self.repeats.remove(key)
+            if isinstance(record, StepRewards):
+                # the bag keeps only the first labels, and the next commits name all of them
+                self.recorder.receive(record)
             return
         if self.bag is not None:
             self.bag.write(record)
