@@ -54,8 +54,10 @@ def finish(started: Command, folder: Path, code: int = 0) -> tuple[dict[str, Any
 
 
 def start(config: Path, folder: Path, *flags: str) -> Forked:
-    """Fork `codetr train`, in a session of its own; its nodes are forked too."""
-    arguments = ('train', '--config', str(config), '--out', str(folder), *flags)
+    """Fork `codetr train`, in a session of its own; its nodes are forked too. The robot is not
+    drawn: that takes longer than many of these runs.
+    """
+    arguments = ('train', '--config', str(config), '--out', str(folder), '--no-film', *flags)
     return codetr(*arguments, environment=os.environ | {'COLUMNS': '160'})
 
 
