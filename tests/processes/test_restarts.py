@@ -1,10 +1,11 @@
+import os
 import signal
 from pathlib import Path
 
 import pytest
 
 from codetr_ros.processes import restarts
-from codetr_ros.processes.launcher import Processes
+from codetr_ros.processes.launcher import Node, Processes
 from codetr_ros.processes.restarts import Restarts
 from codetr_ros.processes.supervise import Interrupts, Silence, is_over, supervise
 from codetr_ros.runs import folder as run_folder
@@ -98,3 +99,37 @@ def test_a_node_that_is_killed_when_all_is_done_is_left_alone(
     (node,) = processes.nodes
     run_folder.report_path(tmp_path, 'record', 'record').unlink()
     assert not is_over(node, tmp_path)  # the recorder may still need something of it
+
+
+def test_a_node_that_dies_while_another_is_started_again_is_started_again_too(
+    tmp_path: Path, processes: Processes
+) -> None:
+    first = f"""
+import os, time
+if not os.path.exists({str(tmp_path / 'again')!r}):
+    open({str(tmp_path / 'again')!r}, 'w').close()
+    time.sleep(600)
+"""
+    start(
+        processes,
+        tmp_path,
+        python('record', first),
+        python('sim', DIES_TWICE, tmp_path / 'count'),
+    )
+    some = Restarts()
+
+    def over(node: Node) -> bool:
+        record = processes.nodes[0]
+        if node.name == 'sim' and not some.counts['record'] and record.code is None:
+            while not (tmp_path / 'again').exists():
+                pass
+            os.kill(record.process.pid, signal.SIGKILL)
+            record.process.wait()
+        return False
+
+    failure = supervise(
+        processes, poll(processes), Interrupts(), Silence(), restarts=some, over=over
+    )
+
+    assert failure is None
+    assert some.counts == {'sim': 2, 'record': 1}

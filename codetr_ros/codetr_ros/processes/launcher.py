@@ -336,10 +336,6 @@ class Processes:
         """The processes that have not ended."""
         return [node for node in self.nodes if node.code is None]
 
-    def failed(self) -> Node | None:
-        """The first that ended with an error without being asked to end."""
-        return next((node for node in self.nodes if node.unasked_failure), None)
-
     def stop(self) -> None:
         """Ask all that run to end, the recorder last so that it misses nothing."""
         self._end([node for node in self.running() if node.role != 'record'])

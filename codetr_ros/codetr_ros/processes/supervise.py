@@ -112,12 +112,11 @@ def supervise(
             processes.log('stopping: nodes end their slice and save (Ctrl-C again to hurry)')
             processes.stop()
             return _after_stop(processes)
-        if _start_again(processes, restarts, over):
-            silence.broken()
-        running = processes.running()
-        if (failed := processes.failed()) is not None:
+        failed = _start_again(processes, restarts, over, silence)
+        if failed is not None:
             died = failed.how_it_ended() + restarts.exhausted(failed.name, failed.code)
             return _stop_all(processes, died)
+        running = processes.running()
         for node in processes.nodes:
             if node.code == 0 and (reason := gave_up(node)) is not None:
                 return _stop_all(processes, reason)
@@ -132,9 +131,13 @@ def supervise(
             return _stop_all(processes, text)
 
 
-def _start_again(processes: Processes, restarts: Restarts, over: Callable[[Node], bool]) -> bool:
-    """Start the nodes again that were killed and may be; whether there were any."""
-    some = False
+def _start_again(
+    processes: Processes, restarts: Restarts, over: Callable[[Node], bool], silence: Silence
+) -> Node | None:
+    """Start the nodes again that were killed and may be; the first that failed for good, if any.
+
+    Each node is looked at once: of two that are killed together the second may die meanwhile.
+    """
     for node in processes.nodes:
         if not node.unasked_failure:
             continue
@@ -144,8 +147,10 @@ def _start_again(processes: Processes, restarts: Restarts, over: Callable[[Node]
             times = restarts.counts[node.name]
             processes.log(f'{node.how_it_ended()}: starting it again (number {times})')
             processes.start_again(node)
-            some = True
-    return some
+            silence.broken()
+        else:
+            return node
+    return None
 
 
 def _stop_all(processes: Processes, reason: str) -> str:
