@@ -1,7 +1,7 @@
 """The command `codetr`. Everything slow to import is imported by the command that needs it."""
 
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 USAGE = 2
 """Exit code for what the user can correct on the command line, the same as argparse's."""
@@ -192,6 +192,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
         text = f'{error.filename}: {error.strerror}. {remedy(error).capitalize()}'
         print(f'codetr: {error if own else text}', file=sys.stderr)
         return FAILED
+
+
+def carry_out_one_of(
+    group: str,
+    help_text: str,
+    commands: Mapping[str, Callable[[Sequence[str]], int]],
+    arguments: Sequence[str],
+) -> int:
+    """Carry out a command of a group, such as `bag info`; returns the exit code.
+
+    Args:
+        group: the name of the group.
+        help_text: lists its commands.
+        commands: each by its name.
+        arguments: the command, and what it is given.
+    """
+    if not arguments:
+        print(help_text, end='', file=sys.stderr)
+        return USAGE
+    if arguments[0] in ('-h', '--help', 'help'):
+        print(help_text, end='')
+        raise SystemExit(0)  # as after --help of the other commands
+    command = commands.get(arguments[0])
+    if command is None:
+        return refuse_command(f'{group} {arguments[0]}', arguments[0], commands)
+    return command(arguments[1:])
 
 
 def refuse_command(shown: str, given: str, known: Iterable[str]) -> int:

@@ -1,9 +1,8 @@
 """`codetr bag`: show, check, recover and play bags."""
 
-import sys
 from collections.abc import Callable, Sequence
 
-from codetr_ros.cli import USAGE, refuse_command
+from codetr_ros.cli import carry_out_one_of
 
 HELP = """usage: codetr bag COMMAND BAG [OPTIONS]
 
@@ -54,13 +53,4 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
 
 def main(arguments: Sequence[str]) -> int:
     """Carry out one of the commands; returns the exit code."""
-    if not arguments:
-        print(HELP, end='', file=sys.stderr)
-        return USAGE
-    if arguments[0] in ('-h', '--help', 'help'):
-        print(HELP, end='')
-        raise SystemExit(0)  # as after --help of the other commands
-    command = COMMANDS.get(arguments[0])
-    if command is None:
-        return refuse_command(f'bag {arguments[0]}', arguments[0], COMMANDS)
-    return command(arguments[1:])
+    return carry_out_one_of('bag', HELP, COMMANDS, arguments)

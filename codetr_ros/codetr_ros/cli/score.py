@@ -14,7 +14,7 @@ import tyro
 
 from codetr_ros.cli import refuse
 from codetr_ros.cli.terminal import console, parse_arguments
-from codetr_ros.cli.watch import HOST_HELP
+from codetr_ros.cli.watch import AllowedNames, Host, Port
 from codetr_ros.processes import middleware
 
 if TYPE_CHECKING:
@@ -52,16 +52,9 @@ class Arguments:
             help='3 to 9 points, the highest is best; or number, for any number',
         ),
     ] = '1:5'
-    host: Annotated[str, tyro.conf.arg(metavar='ADDRESS', help=HOST_HELP)] = '127.0.0.1'
-    port: Annotated[
-        int, tyro.conf.arg(metavar='N', help='port to answer at; 0: one that is free')
-    ] = 0
-    allow_name: Annotated[
-        tuple[str, ...],
-        tyro.conf.arg(
-            metavar='NAME', help='further names of this machine by which browsers may ask'
-        ),
-    ] = ()
+    host: Host = '127.0.0.1'
+    port: Port = 0
+    allow_name: AllowedNames = ()
     peer_deadline: Annotated[
         float, tyro.conf.arg(metavar='S', help='seconds to wait for the run; 0: for ever')
     ] = 60.0

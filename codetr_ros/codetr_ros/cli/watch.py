@@ -17,10 +17,20 @@ POLL = 0.25
 """Seconds between two looks at the folder."""
 NICENESS = 10
 """Whoever watches a run must not slow it down."""
-HOST_HELP = (
-    'address to answer at: this machine only by default; 0.0.0.0 for all that reach it, who then '
-    'need the token of the printed address'
-)
+Host = Annotated[
+    str,
+    tyro.conf.arg(
+        metavar='ADDRESS',
+        help='address to answer at: this machine only by default; 0.0.0.0 for all that reach it, '
+        'who then need the token of the printed address',
+    ),
+]
+Port = Annotated[int, tyro.conf.arg(metavar='N', help='port to answer at; 0: one that is free')]
+AllowedNames = Annotated[
+    tuple[str, ...],
+    tyro.conf.arg(metavar='NAME', help='further names of this machine by which browsers may ask'),
+]
+"""Where a page in the browser is served: of every command that serves one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,16 +43,9 @@ class Arguments:
     run_dir: Annotated[
         str, tyro.conf.Positional, tyro.conf.arg(metavar='RUN', help="the run's folder")
     ]
-    host: Annotated[str, tyro.conf.arg(metavar='ADDRESS', help=HOST_HELP)] = '127.0.0.1'
-    port: Annotated[
-        int, tyro.conf.arg(metavar='N', help='port to answer at; 0: one that is free')
-    ] = 0
-    allow_name: Annotated[
-        tuple[str, ...],
-        tyro.conf.arg(
-            metavar='NAME', help='further names of this machine by which browsers may ask'
-        ),
-    ] = ()
+    host: Host = '127.0.0.1'
+    port: Port = 0
+    allow_name: AllowedNames = ()
     video: Annotated[
         bool | None,
         tyro.conf.arg(
