@@ -11,8 +11,10 @@ from typing import Any
 
 from codetr_ros.bags.errors import BagError
 from codetr_ros.config import Settings, queues
-from codetr_ros.records import TOPICS, fields
+from codetr_ros.records import TOPICS, Presence, fields
 
+RECORDED: tuple[type, ...] = tuple(kind for kind in TOPICS if kind is not Presence)
+"""Kinds of records that a run's bag holds. `Presence` only shows that a node is alive."""
 _FOREVER = {'sec': 9223372036, 'nsec': 854775807}
 
 

@@ -139,18 +139,21 @@ class Parts:
         """Record what a part has published, and hand it to all that take such records in, but for
         one that has it already.
         """
+        kept, have_it = record, {without}
+        if isinstance(record, StepRewards):
+            # also of those that the bag holds: it keeps the first labels, commits name all
+            self.recorder.receive(record)
+            kept = self.recorder.kept(record)
+            have_it.add('record')
         key = type(record), identity(record)
         if key in self.repeats:
             self.repeats.remove(key)
-            if isinstance(record, StepRewards):
-                # the bag keeps only the first labels, and the next commits name all of them
-                self.recorder.receive(record)
             return
         if self.bag is not None:
-            self.bag.write(record)
+            self.bag.write(kept)
         self.count(name, record)
         for reader, member in self.members.items():
-            if type(record) in member.core.subscribes and reader != without:
+            if type(record) in member.core.subscribes and reader not in have_it:
                 member.core.receive(record)
         self._observe(record)
 

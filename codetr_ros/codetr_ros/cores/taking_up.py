@@ -9,7 +9,6 @@ holds. Without such checkpoints everything is learnt again, from the bag alone.
 
 import logging
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import torch
@@ -17,7 +16,6 @@ import torch
 from codetr_ros.bags.cutting import Cut, announced, cut
 from codetr_ros.bags.definitions import decode
 from codetr_ros.bags.errors import BagError
-from codetr_ros.bags.first_labels import FirstLabels
 from codetr_ros.bags.raw import RawMessage
 from codetr_ros.bags.reopening import reopen
 from codetr_ros.config import Settings, from_canonical, settled
@@ -182,10 +180,9 @@ class _Past:
         phase = self._common(self._known)
         for consumer in self._consumers.values():
             consumer.resume(phase)
-        first = FirstLabels(parts.settings)
-        written = reopen(bag, partial(self._take, first))
+        written = reopen(bag, self._take)
         namespace = namespace_of(parts.spec.run_id)
-        parts.bag = RunBag(bag, parts.settings, namespace, written, first)
+        parts.bag = RunBag(bag, parts.settings, namespace, written)
         for simulator in parts.simulators.values():
             simulator.resume(last + 1)
         for policy in self._policies.values():
@@ -226,7 +223,7 @@ class _Past:
             self._log(f'learner and reward side go on from their checkpoints of phase {common}')
         return common
 
-    def _take(self, first: FirstLabels, message: RawMessage) -> None:
+    def _take(self, message: RawMessage) -> None:
         """Hand the next message of the bag to those that had it."""
         kind = RECORD_TYPES.get(message.channel.type)
         if kind is None or kind in (RunSpec, Presence):
@@ -238,8 +235,6 @@ class _Past:
         for simulator in parts.simulators.values():
             simulator.restore(record)
         parts.evaluator.restore(record)
-        if isinstance(record, StepRewards):
-            first.keep(record)
         if self._comes_again(record):
             parts.repeats.add((type(record), identity(record)))
         self._keep_policies(record)

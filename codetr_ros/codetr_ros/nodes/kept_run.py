@@ -1,13 +1,13 @@
 """What a recorder keeps of a run: its bag, if it has one, and what it can send again."""
 
-import time
-from collections import Counter, defaultdict, deque
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator
 from itertools import chain
 from pathlib import Path
 
 from codetr_ros.bags.definitions import decode
 from codetr_ros.bags.errors import BagError, Damage
+from codetr_ros.bags.flushes import Flushes
 from codetr_ros.bags.phases import Phases
 from codetr_ros.bags.raw import RawMessage
 from codetr_ros.bags.reader import Bag
@@ -19,10 +19,7 @@ from codetr_ros.nodes.repeats import Repeats
 from codetr_ros.records import TOPICS, Commit, EpisodeResult, Record, RecordError, RunSpec
 from codetr_ros.records.fields import RECORD_TYPES, type_name
 from codetr_ros.records.identity import phase_of
-from codetr_ros.runs.reports import BagReport, FlushTimes
-
-FLUSHES = 1000
-"""Number of the newest flushes, whose median the report gives."""
+from codetr_ros.runs.reports import BagReport
 
 
 class KeptRun:
@@ -63,8 +60,7 @@ class KeptRun:
         self._phases = Phases()
         self._last = LastPhases(phases)
         self._evaluations: dict[int, list[bytes]] = defaultdict(list)  # results, by version
-        self._flush_seconds = self._longest_flush = 0.0
-        self._flushes: deque[float] = deque(maxlen=FLUSHES)  # seconds, the newest
+        self._flushes = Flushes()
 
     def open(self, run_id: str, restore: Callable[[Record, bytes], None]) -> None:
         """Open the bag: a new one, or that of this run which is there, which is made whole first.
@@ -158,14 +154,9 @@ class KeptRun:
         Raises:
             BagError: it cannot be written.
         """
-        if self._writer is None:
-            return
-        began = time.perf_counter()
-        self._writer.flush()
-        seconds = time.perf_counter() - began
-        self._flushes.append(seconds)
-        self._flush_seconds += seconds
-        self._longest_flush = max(self._longest_flush, seconds)
+        if self._writer is not None:
+            with self._flushes.timed():
+                self._writer.flush()
 
     # ---- sending again
 
@@ -209,14 +200,12 @@ class KeptRun:
 
     def report(self) -> BagReport:
         """What was recorded, and where."""
-        flushes = sorted(self._flushes)
-        median = 1e3 * flushes[len(flushes) // 2] if flushes else 0.0
         return BagReport(
             recorded=dict(self.recorded),
             bag=str(self.folder) if self._writer else None,
             bag_bytes=self._writer.size if self._writer else 0,
-            flush_seconds=self._flush_seconds,
-            flush_ms=FlushTimes(median=median, max=1e3 * self._longest_flush),
+            flush_seconds=self._flushes.seconds,
+            flush_ms=self._flushes.times(),
         )
 
 

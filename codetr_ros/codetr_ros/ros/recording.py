@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from codetr_ros.bags.definitions import decode_sent, encode, stamp_of
-from codetr_ros.bags.topics import topics_of_run
+from codetr_ros.bags.topics import RECORDED, topics_of_run
 from codetr_ros.cores.beside import Beside, Early
 from codetr_ros.cores.recorder import Recorder
 from codetr_ros.nodes.kept_run import KeptRun
@@ -29,7 +29,6 @@ from codetr_ros.records import (
     CompositeReward,
     Policy,
     Preference,
-    Presence,
     Record,
     RecordError,
     RunSpec,
@@ -48,8 +47,6 @@ from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.reports import BagReport
 
 JUDGEMENTS = (CompositeReward, Preference)
-NOT_RECORDED = (Presence,)
-"""Published once a second to show that a node is alive: no part of the run itself."""
 
 
 class Recording(Wiring):
@@ -59,11 +56,10 @@ class Recording(Wiring):
         super().__init__(member, joined)
         settings = joined.settings
         self._settling = Settling(member.link.full_name, member.peers, member.limit)
-        self._kinds = [kind for kind in TOPICS if kind not in NOT_RECORDED]
-        names = {k: member.link.node.resolve_topic_name(TOPICS[k]) for k in self._kinds}
+        names = {k: member.link.node.resolve_topic_name(TOPICS[k]) for k in RECORDED}
         self._bag = KeptRun(
             self._bag_folder(),
-            dict(zip(self._kinds, topics_of_run(names, settings), strict=True)),
+            dict(zip(RECORDED, topics_of_run(names, settings), strict=True)),
             settings.ahead + 2,
             settings.phase_steps,
             round(member.values['bag_split_mb'] * 1e6),
@@ -88,7 +84,7 @@ class Recording(Wiring):
             self.log.info(f'records to {bag.folder}')
         if not bag.recorded[TOPICS[RunSpec]]:
             self._write(self.joined.run, self.member.announcement)
-        for kind in self._kinds:
+        for kind in RECORDED:
             if kind not in (RunSpec, Commit):  # the first has arrived, the second is our own
                 link.subscribe(kind, self.take, settings)
         PhaseService(link, SERVICE, run_id, bag.read, lambda: bag.newest)
