@@ -108,6 +108,8 @@ def outcome(tmp_path_factory):
     with domain(), Nodes(settings, folder / 'run') as nodes, Witness(nodes) as witness:
         nodes.start_before(witness)
         witness.until(lambda: witness.committed(1) and witness.scores)
+        # the simulator begins once it has found the evaluator, which may not have found it yet
+        witness.until(lambda: 'everybody is there' in nodes.log('evaluate'))
         nodes.send(signal.SIGSTOP, 'sim')  # it waits for the next policy: no step, no phase
         witness.say(*bad_transitions())
         witness.say(*bad_scores(witness.scores[0]))
