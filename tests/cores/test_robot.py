@@ -22,13 +22,13 @@ class Bench:
         self.clock = Clock()
         self.robot = Robot(run(self.settings), self.settings, 'robot', rules(live), self.clock)
         self.sent: list[list[float]] = []
-        self.robot.send = lambda command: self.sent.append(command.tolist())
+        self.robot.driving.send = lambda command: self.sent.append(command.tolist())
         self.work = self.robot.work()
         self.records: list[Any] = []
         assert next(self.work) is None
         self.sense()
         (self.spec,) = next(self.work)
-        self.robot.activate()
+        self.robot.driving.activate()
 
     def sense(self) -> None:
         self.robot.senses.take('/joint_states', joints(self.clock.now), self.clock.now)

@@ -52,7 +52,7 @@ class FreeRun:
         self._given = 0
         self._near: dict[int, list[float]] = {}
         self.tick = 0
-        self.robot.send = self._command
+        self.robot.driving.send = self._command
 
     def _command(self, command: np.ndarray) -> None:
         self._velocity = command
@@ -71,7 +71,7 @@ class FreeRun:
         self._position = 0.95 * (self._position + 0.1 * self._velocity)
         self.robot.senses.take('/joint_states', joints(*self._position), self.clock.now)
         if self.robot.senses.size and not self.robot.control.active:
-            self.robot.activate()
+            self.robot.driving.activate()
         self._publish(self._works[0])
         for due, score in [each for each in self._later if each[0] <= self.tick]:
             self._later.remove((due, score))

@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -20,7 +19,6 @@ from codetr_ros.cores.core import Part
 from codetr_ros.policy.acting import ActingPolicy, uniform_actions
 from codetr_ros.records import (
     F32,
-    F64,
     INITIAL_VERSION,
     PROTOCOL_VERSION,
     Metrics,
@@ -35,18 +33,13 @@ from codetr_ros.records import (
 )
 from codetr_ros.records.roles import subscribed
 from codetr_ros.robots import mapping
-from codetr_ros.robots.control import Control
-from codetr_ros.robots.deadlines import Deadlines
-from codetr_ros.robots.errors import MessageError
-from codetr_ros.robots.guard import Guard, Hold
-from codetr_ros.robots.reset import Resetting
-from codetr_ros.robots.senses import Senses
+from codetr_ros.robots.driving import Driving
+from codetr_ros.robots.guard import Hold
 from codetr_ros.robots.steplog import StepLog
 from codetr_ros.runs.reports import CoreReport
 from codetr_ros.seeding import generator
 from codetr_ros.simulation.permission import acting_policy, check_policy
 
-BACK = 0.1  # [s] by which a clock must go back to have been set back
 PERMISSION, BEHIND, FINISHED = 'permission', 'learner behind', 'end of the run'
 
 
@@ -70,8 +63,8 @@ class Stage:
 class Robot(Part):
     """Drives a robot under the policies that it receives.
 
-    The wiring sets `send` and `ask_for_reset`, and calls `senses.take` for what the robot
-    publishes. A control step is taken by `work` once it is due by the clock.
+    A control step is taken by `work` once it is due by the clock. `driving` is what the driver of
+    the robot is connected to.
 
     Args:
         run: the run it belongs to.
@@ -115,30 +108,13 @@ class Robot(Part):
         self._run = run
         self._settings = settings
         self._name = name
-        self.clock = clock
-        self.rules = rules
-        self.send: Callable[[F64], None] = lambda command: None
-        self.ask_for_reset: Callable[[], None] = lambda: None
-        self.deadlines = Deadlines(self._live.period)
         self._log = StepLog(run.run_id, name, settings.steps_of)
-        self.senses = Senses(rules)
-        self.guard = Guard(self._live, self.senses, clock())
-        self.control = Control(
-            rules,
-            self.senses,
-            self.guard,
-            self,
-            self._log,
-            self._command,
-            Resetting(self._live.reset, self._ask),
-        )
+        self.driving = Driving(rules, self, self._log, clock)
+        self.senses, self.control = self.driving.senses, self.driving.control
         self._permitted: dict[int, tuple[Policy, ActingPolicy | None]] = {}
         self._now: tuple[Policy, ActingPolicy | None] | None = None  # under which it acts
         self._newest: tuple[Policy, ActingPolicy | None] | None = None
         self._last: Policy | None = None  # the one that permits nothing more
-        self._out: list[Record] = []  # made between two slices
-        self._clock_at = clock()
-        self._counters: Counter[str] = Counter()
         self.versions: Counter[int] = Counter()  # steps begun under each policy
 
     # ---- records
@@ -206,33 +182,19 @@ class Robot(Part):
         while not self.senses.size:
             yield None
         yield [self._spec()]
-        if self.control.active:  # before anything was observed
-            self.deadlines.start(self.clock())
+        self.driving.begin()
         while not self.finished:
-            self._check_clock()
-            if not self.deadlines.reached(self.clock()):
-                yield self._given([])
-                continue
-            yield self._given(self.control.tick(self.clock()))
+            yield self._given(self.driving.step()) or None
             if self._last is not None and self._log.phase >= self._settings.phases:
-                yield self.deactivate()
+                yield self._given(self.driving.deactivate())
                 self.finished = True
         while True:
             yield None
 
-    def _given(self, records: list[Transitions]) -> list[Record] | None:
-        """Records, those that were made between two slices first; None if nothing is due."""
-        given = [*self._out, *records]
-        self._out = []
-        for record in records:
-            if record.phase_end:
-                given.append(self._metrics(record.phase))
-        return given or None
-
-    @property
-    def pause(self) -> float:
-        """Seconds until the next control step is due."""
-        return max(0.0, self.deadlines.due - self.clock())
+    def _given(self, records: list[Transitions]) -> list[Record]:
+        """Records, and the metrics of each phase that ends with them."""
+        ended = [record.phase for record in records if record.phase_end]
+        return [*records, *map(self._metrics, ended)]
 
     def _choose(self) -> None:
         """Take the newest policy, or the one of the phase that the next step belongs to."""
@@ -244,12 +206,6 @@ class Robot(Part):
             self._now = self._permitted.get(phase)
 
     # ---- for the control
-
-    def _command(self, command: F64) -> None:
-        self.send(command)
-
-    def _ask(self) -> None:
-        self.ask_for_reset()
 
     def withheld(self) -> Hold | None:
         """Choose the policy of this control step; returns why none acts, or None if one does."""
@@ -281,99 +237,29 @@ class Robot(Part):
             return drawn
         return acting.act(observation, rng.standard_normal(size, dtype=np.float32), step)
 
-    # ---- what people ask for
-
-    def use_clock(self, clock: Callable[[], float]) -> None:
-        """Take the time from another clock [s]."""
-        self.clock = clock
-        self._restart(clock())
-
-    def _restart(self, now: float) -> None:
-        self._clock_at = now
-        self.guard.restart(now)
-        if self.control.active:
-            self.deadlines.start(now)
-
-    def _check_clock(self) -> None:
-        """Hold nothing that lies in the future, where the clock was set back."""
-        now = self.clock()
-        if now < self._clock_at - BACK:
-            self.senses.forget()
-            self.control.halt()
-            self._restart(now)
-            self._counters['times that the clock went back'] += 1
-        self._clock_at = max(now, self._clock_at)
-
-    def activate(self) -> None:
-        """Drive the robot: the first control step is due now."""
-        self.control.activate()
-        self.deadlines.start(self.clock())
-
-    def deactivate(self) -> list[Record]:
-        """Send the safe command once more, then none."""
-        records = self._given(self.control.deactivate())
-        self.deadlines.stop()
-        return records or []
-
-    def stop(self, why: str) -> None:
-        """Stop the robot at once, until a person lets it go on."""
-        self.control.stop(why)
-
-    def stop_message(self, pressed: bool) -> None:
-        """Take a message of the stop topic; true stops the robot at once."""
-        new = pressed and not self.guard.stopped
-        self.guard.stop_message(pressed, self.clock())
-        if new:
-            self.control.halt()
-
-    def episode_message(self, message: Any) -> None:
-        """Take a message of the episode topic, which ends the episode where the mapping has it."""
-        try:
-            ends = self.rules.episode.ends(message)
-        except MessageError as error:
-            self.senses.unreadable(error)
-            return
-        if ends:
-            self.control.end_episode()
-
-    def leave_active(self) -> None:
-        """The same between two slices."""
-        self._out = self.deactivate()
-
     # ---- reports
 
     def waiting_for(self) -> str:
         """What the robot waits for, for people."""
-        if lacking := self.senses.lacking():
-            fault = f' ({self.senses.fault})' if self.senses.fault else ''
-            return f'the first message on {", ".join(lacking)}{fault}'
-        if not self.control.active:
-            return 'the service `activate`, which lets it move the robot'
-        held = self.control.held
-        return held.why if held is not None else 'the next control step'
+        return self.driving.waiting_for()
 
     def _metrics(self, phase: int) -> Metrics:
         step = self._settings.steps_after(phase)
-        values = self.deadlines.metrics() | {'episodes': float(self.control.counts['episodes'])}
+        values = self.driving.deadlines.metrics()
+        values['episodes'] = float(self.control.counts['episodes'])
         if self._now is not None:
             values['policy_version'] = float(self._now[0].version)
         return metrics(self._run.run_id, 'sim', self._name, phase, step, values)
 
     def close(self) -> None:
         """Leave the robot with the safe command."""
-        if self.control.active:
-            self.control.halt()
-            self.control.active = False
+        self.driving.close()
 
     def report(self) -> CoreReport:
         """Counts for the run's summary."""
-        counters = self.control.counts + self.senses.counts + self._counters
+        counters = self.driving.counts()
         counters['steps'] = self._log.total
         counters['policies used'] = len(self.versions)
-        whole = {name: round(value) for name, value in self.deadlines.metrics().items()}
-        counters['control steps'] = whole['control_steps']
-        counters['control deadlines missed'] = whole['deadlines_missed']
-        counters['resets that failed'] = self.control.reset.failures
         return CoreReport(
             duplicated=dict(self.duplicated), counters={k: n for k, n in counters.items() if n}
         )

@@ -1,8 +1,8 @@
 """The node that faces the robot: its topics, its command, and the services for people.
 
-It is a lifecycle node beside the run's node, in the same process and thread: unconfigured,
-inactive once the robot's topics are there, active while it sends commands. Callbacks store what
-arrived; only a stop acts at once.
+It is a lifecycle node beside that of the run or of the policy, in the same process and thread:
+unconfigured, inactive once the robot's topics are there, active while it sends commands. Callbacks
+store what arrived; only a stop acts at once.
 """
 
 from collections.abc import Callable, Iterable
@@ -14,8 +14,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool, Trigger
 
-from codetr_ros.cores.robot import Robot
 from codetr_ros.records import F64
+from codetr_ros.robots.driving import Driving
 from codetr_ros.ros.commands import CommandMessages, message_class
 from codetr_ros.ros.link import Link
 
@@ -29,11 +29,11 @@ class Driver(LifecycleNode):  # type: ignore[misc]
     """The topics and services of a robot.
 
     Args:
-        link: the connection of the run's node, which gives this one its turns.
-        robot: the core.
+        link: the connection of the node beside it, which gives this one its turns.
+        robot: what drives it.
     """
 
-    def __init__(self, link: Link, robot: Robot) -> None:
+    def __init__(self, link: Link, robot: Driving) -> None:
         simulated = link.node.get_parameter('use_sim_time').value
         super().__init__(
             f'{link.name}_driver',
