@@ -130,6 +130,18 @@ def test_a_phase_of_a_free_robot_is_committed_without_a_permission_once_it_is_wh
     assert (made.phase, made.transitions.tolist(), made.scorers) == (0, [1], ())
 
 
+def test_scores_that_a_robot_gives_itself_join_the_next_commit_like_those_of_anybody():
+    r = recorder(task='robot/arm', pace='free', evaluate_every=0, scorer='topic')
+    work = r.work()
+    given = [score(sequence=n, scorer='sim', first_step=5 * n) for n in range(2)]
+    for phase, late in enumerate(given):
+        r.receive(late)
+        steps = {'first_step': 200 * phase, 'steps': 200, 'phase_end': True}
+        r.receive(transitions(sequence=phase, phase=phase, **steps))
+        (made,) = commits(r, work)
+        assert (made.scorers, made.scores.tolist()) == (('sim',), [phase])
+
+
 def test_a_free_robot_may_be_phases_ahead_of_the_permission_that_arrives():
     r = recorder(task='robot/arm', pace='free', evaluate_every=0)
     work = r.work()

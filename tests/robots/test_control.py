@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from codetr_ros.config.cuts import Cuts
 from codetr_ros.robots.control import NO_NEXT, TOO_LATE, Control
 from codetr_ros.robots.guard import Guard, Hold
+from codetr_ros.robots.live_scores import LiveScores
 from codetr_ros.robots.reset import Resetting
 from codetr_ros.robots.senses import Senses
 from codetr_ros.robots.steplog import StepLog
@@ -32,6 +34,7 @@ class Bench:
             mapping, self.senses, self.guard, self, log,
             lambda command: self.sent.append(command.tolist()),
             Resetting(mapping.live.reset, self.ask),
+            LiveScores(mapping, 'run', 'arm', Cuts(5, 0), lambda: log.phase),
         )  # fmt: skip
         self.control.activate()
 
@@ -218,7 +221,7 @@ def test_a_person_resets_the_robot_which_is_held_until_then():
 def test_deactivated_it_is_left_with_the_safe_command_and_gets_no_other():
     bench = Bench()
     bench.step(3)
-    (last,) = bench.control.deactivate()
+    (last,) = bench.control.deactivate(bench.now)
     assert (last.steps, last.truncated, bench.sent[-1]) == (2, True, SAFE)
     before = len(bench.sent)
     bench.step(3)

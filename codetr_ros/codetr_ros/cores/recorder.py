@@ -363,7 +363,8 @@ class Recorder(Part):
             del self._steps[phase, source]
             last.append(sequence)
             self._committed_scores[source] += due
-        for scorer in scorers - set(members):  # a person, an inspection: all scores so far
+        waited_for = () if self._settings.scored_elsewhere else members
+        for scorer in scorers.difference(waited_for):  # a person, a robot itself: all so far
             self._committed_scores[scorer] = self._scores[scorer]
         self.phase = phase + 1  # at once: labels of the phase may be here before the next slice
         names = tuple(sorted(s for s in scorers if self._committed_scores[s]))

@@ -35,6 +35,7 @@ from codetr_ros.records.roles import subscribed
 from codetr_ros.robots import mapping
 from codetr_ros.robots.driving import Driving
 from codetr_ros.robots.guard import Hold
+from codetr_ros.robots.live_scores import LiveScores, scoring
 from codetr_ros.robots.steplog import StepLog
 from codetr_ros.runs.reports import CoreReport
 from codetr_ros.seeding import generator
@@ -109,7 +110,11 @@ class Robot(Part):
         self._settings = settings
         self._name = name
         self._log = StepLog(run.run_id, name, settings.steps_of)
-        self.driving = Driving(rules, self, self._log, clock)
+        rules = scoring(rules, settings, name)
+        self._scores = LiveScores(
+            rules, run.run_id, name, settings.cuts, lambda: self._log.phase
+        )
+        self.driving = Driving(rules, self, self._log, clock, self._scores)
         self.senses, self.control = self.driving.senses, self.driving.control
         self._permitted: dict[int, tuple[Policy, ActingPolicy | None]] = {}
         self._now: tuple[Policy, ActingPolicy | None] | None = None  # under which it acts
@@ -192,9 +197,9 @@ class Robot(Part):
             yield None
 
     def _given(self, records: list[Transitions]) -> list[Record]:
-        """Records, and the metrics of each phase that ends with them."""
+        """Records and scores, and the metrics of each phase that ends with them."""
         ended = [record.phase for record in records if record.phase_end]
-        return [*records, *map(self._metrics, ended)]
+        return [*records, *self._scores.taken(), *map(self._metrics, ended)]
 
     def _choose(self) -> None:
         """Take the newest policy, or the one of the phase that the next step belongs to."""
@@ -257,7 +262,7 @@ class Robot(Part):
 
     def report(self) -> CoreReport:
         """Counts for the run's summary."""
-        counters = self.driving.counts()
+        counters = self.driving.counts() + self._scores.report()
         counters['steps'] = self._log.total
         counters['policies used'] = len(self.versions)
         return CoreReport(

@@ -10,6 +10,7 @@ from typing import Protocol
 from codetr_ros.records import F32, F64, Transitions
 from codetr_ros.robots.guard import SPEED, STOP, Guard, Hold
 from codetr_ros.robots.limits import Limiter
+from codetr_ros.robots.live_scores import LiveScores
 from codetr_ros.robots.mapping import Mapping
 from codetr_ros.robots.reset import Resetting
 from codetr_ros.robots.senses import Senses
@@ -40,6 +41,7 @@ class Control:
         log: records the steps.
         send: sends a command (A,) to the robot.
         reset: lets the robot reset itself.
+        scores: what the robot scores itself.
     """
 
     def __init__(
@@ -51,6 +53,7 @@ class Control:
         log: StepLog,
         send: Callable[[F64], None],
         reset: Resetting,
+        scores: LiveScores,
     ) -> None:
         live = rules.live
         assert live is not None
@@ -61,6 +64,7 @@ class Control:
         self._log = log
         self._send_on = send
         self.reset = reset
+        self.scores = scores
         self.active = False
         self.running = False  # an episode is under way
         self.held: Hold | None = None
@@ -77,9 +81,10 @@ class Control:
         self.active = True
         self.reset.begin()
 
-    def deactivate(self) -> list[Transitions]:
-        """Send the safe command once more, and then none; returns the last record."""
-        records = self._end() if self.active else []
+    def deactivate(self, now: float) -> list[Transitions]:
+        """Send the safe command once more, now [s], and then none; returns the last record."""
+        self._drop_pending()
+        records = self._end(now) if self.active else []
         if self.active:
             self._safe()
         self.active = False
@@ -92,11 +97,16 @@ class Control:
 
     def halt(self) -> None:
         """Send the safe command at once, and drop the step that was begun."""
-        if self._pending is not None:
-            self._pending = None
-            self.counts[NO_NEXT] += 1
+        self._drop_pending()
         if self.active:
             self._safe()
+
+    def _drop_pending(self, why: str = NO_NEXT) -> None:
+        """Drop the step that was begun, if there is one."""
+        if self._pending is not None:
+            self._pending = None
+            self.counts[why] += 1
+            self.scores.step_dropped()
 
     def end_episode(self) -> None:
         """End the episode with the next step: a message has ended it."""
@@ -113,11 +123,12 @@ class Control:
         records = self._complete(observation, now)
         self.held = self.held or self._policy.withheld()
         if self.running and self._episode_ends():
-            records += self._end(self._over and self._rules.episode.terminal)
+            records += self._end(now, self._over and self._rules.episode.terminal)
         if not self.running:
             self._try_to_begin(now)
         if self.running and observation is not None:
-            self._act(observation)
+            self._act(observation, now)
+        self.scores.look(now)
         return records
 
     def _complete(self, observation: F32 | None, now: float) -> list[Transitions]:
@@ -126,28 +137,31 @@ class Control:
             now - self._tick_at > self._live.watchdog.late * self._live.period
         )
         self._tick_at = now
-        pending, self._pending = self._pending, None
-        if pending is None:
+        if self._pending is None:
             return []
         unsound = self.held is not None and self.held.kind in (STOP, SPEED)
         if observation is None or unsound or late:
-            self.counts[TOO_LATE if late else NO_NEXT] += 1
-            return self._end()
-        return self._log.add(*pending, observation, now)
+            self._drop_pending(TOO_LATE if late else NO_NEXT)
+            return self._end(now)
+        pending, self._pending = self._pending, None
+        records = self._log.add(*pending, observation, now)
+        self.scores.step_whole(self._log.length, now)
+        return records
 
     def _episode_ends(self) -> bool:
         full = self._log.length >= self._live.episode_steps
         return self._over or full or self.held is not None
 
-    def _end(self, terminated: bool = False) -> list[Transitions]:
-        """End the episode, if there is one."""
-        self._pending, self._over = None, False
+    def _end(self, now: float, terminated: bool = False) -> list[Transitions]:
+        """End the episode now [s], if there is one."""
+        self._over = False
         if not self.running:
             return []
         self.running = False
         self.reset.begin()
         if self.held is not None:
             self.counts[f'episodes cut by {self.held.kind}'] += 1
+        self.scores.end(now)
         records = self._log.end(terminated)
         self.counts['episodes'] += bool(records)
         return records
@@ -161,17 +175,19 @@ class Control:
         self.held = self.reset.look(now)
         if self.held is None:
             self._log.begin()
+            self.scores.begin(self._log.episode, now)
             self.running = True
         elif not self.reset.silent:
             self._safe()
 
-    def _act(self, observation: F32) -> None:
+    def _act(self, observation: F32, now: float) -> None:
         wanted = self._policy.act(observation, self._log.length)
         made = self.limiter.command(wanted, self._sent, self.senses.positions())
         for name in made.changed_by:
             self.counts[f'commands changed by limit {name}'] += 1
         self._send(made.command)
         self._pending = (observation, made.action)
+        self.scores.step_begun(now)
 
     def _safe(self) -> None:
         command = self.limiter.safe(self.senses.positions())

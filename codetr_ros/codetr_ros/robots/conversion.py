@@ -27,7 +27,7 @@ HINTS = {
     'joint_state_publisher may beside a driver. The bag does not show which message is of which: '
     'record again with one of them, or filter its messages out of the bag',
     SCORE_OF_EITHER: 'when a score comes while an episode runs, and the end of the one before had '
-    'no score, the bag does not show which one it is of. Give score.late: 0 if scores never come '
+    'no score, nothing shows which one it is of. Give score.late: 0 if scores never come '
     'after the next episode has begun, or the seconds by which they may; or let score.of be '
     'last_episode, or give score.stamp or score.id',
     SCORE_OF_NAMESAKES: 'give score.late, so that a name is looked for among recent episodes only',

@@ -9,11 +9,13 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
+from codetr_ros.config.cuts import Cuts
 from codetr_ros.records import F64, Transitions
 from codetr_ros.robots.control import Control, Policy
 from codetr_ros.robots.deadlines import Deadlines
 from codetr_ros.robots.errors import MessageError
 from codetr_ros.robots.guard import Guard
+from codetr_ros.robots.live_scores import LiveScores
 from codetr_ros.robots.mapping import Mapping
 from codetr_ros.robots.reset import Resetting
 from codetr_ros.robots.senses import Senses
@@ -35,6 +37,7 @@ class Driving:
         policy: decides the actions.
         log: records the steps.
         clock: seconds, never going back.
+        scores: makes records of the robot's own scores; None: nobody wants them.
     """
 
     def __init__(
@@ -43,10 +46,12 @@ class Driving:
         policy: Policy,
         log: StepLog,
         clock: Callable[[], float] = time.monotonic,
+        scores: LiveScores | None = None,
     ) -> None:
         live = rules.live
         assert live is not None
-        self.rules = rules
+        self.rules = rules = rules if scores else rules.model_copy(update={'score': None})
+        self.scores = scores or LiveScores(rules, '', '', Cuts(1, 0), lambda: 0)
         self.clock = clock
         self.send: Callable[[F64], None] = lambda command: None
         self.ask_for_reset: Callable[[], None] = lambda: None
@@ -54,7 +59,9 @@ class Driving:
         self.senses = Senses(rules)
         self.guard = Guard(live, self.senses, clock())
         reset = Resetting(live.reset, self._ask)
-        self.control = Control(rules, self.senses, self.guard, policy, log, self._command, reset)
+        self.control = Control(
+            rules, self.senses, self.guard, policy, log, self._command, reset, self.scores
+        )
         self._clock_at = clock()
         self._out: list[Transitions] = []  # made between two steps
         self._counters: Counter[str] = Counter()
@@ -116,7 +123,7 @@ class Driving:
     def deactivate(self) -> list[Transitions]:
         """Send the safe command once more, then none; returns the last records."""
         given, self._out = self._out, []
-        given = given + self.control.deactivate()
+        given = given + self.control.deactivate(self.clock())
         self.deadlines.stop()
         return given
 
@@ -143,7 +150,13 @@ class Driving:
             self.senses.unreadable(error)
             return
         if ends:
+            assert self.rules.episode.topic is not None
             self.control.end_episode()
+            self.scores.end_message(self.rules.episode.topic, message)
+
+    def score_message(self, topic: str, message: Any, now: float) -> None:
+        """Take a message of the score topic, received now [s]."""
+        self.scores.take(topic, message, now)
 
     def close(self) -> None:
         """Leave the robot with the safe command."""

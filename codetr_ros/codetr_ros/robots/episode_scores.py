@@ -27,15 +27,19 @@ class EpisodeScores:
         rules: the mapping.
         run_id: of the records.
         made: counts scores, and those that are dropped.
+        longest: seconds after its end that an episode is held, at the most.
     """
 
-    def __init__(self, rules: Mapping, run_id: str, made: Conversion) -> None:
+    def __init__(
+        self, rules: Mapping, run_id: str, made: Conversion, longest: float = np.inf
+    ) -> None:
         self._rules = rules
         assert rules.score is not None  # who books scores has a rule for them
         self._rule = rules.score
         self._run_id = run_id
         self._made = made
-        self._horizon = _horizon(rules.score)  # [ns] after its end that an episode is held
+        # [ns] after its end that an episode is held
+        self._horizon = min(_horizon(rules.score), longest * NS)
         self._held = Held()
         self._booking = Booking(rules.score, self._held)
         self._ahead: list[Verdict] = []  # whose time has not come yet
@@ -45,6 +49,18 @@ class EpisodeScores:
         self._next_name: str | None = None
         self._shift = 0  # [ns] from a stamp to the time of steps
         self._forgotten = False  # whether no step is left of the last episode
+        self.booked = 0
+        """Scores that were looked at so far, to see of which steps they are."""
+
+    @property
+    def episodes(self) -> list[ScoredEpisode]:
+        """The episodes that are held, in the order of their steps."""
+        return self._held.episodes
+
+    @property
+    def running(self) -> ScoredEpisode | None:
+        """The episode under way."""
+        return self._held.running
 
     # ------------------------------------------------------------------------------------------
     # episodes
@@ -189,6 +205,7 @@ class EpisodeScores:
         self._ahead = []
 
     def _book(self, verdict: Verdict) -> None:
+        self.booked += 1
         self._count(self._booking.book(verdict), verdict)
 
     def _count(self, fault: str | None, verdict: Verdict) -> None:

@@ -23,6 +23,8 @@ DONE = TransitionCallbackReturn.SUCCESS
 SENSOR_DEPTH = 10
 SENSOR = QoSProfile(depth=SENSOR_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Matches reliable and best-effort publishers; what is older than ten messages is of no use."""
+SCORES_DEPTH = 1000
+"""Scores are few, and each counts."""
 
 
 class Driver(LifecycleNode):  # type: ignore[misc]
@@ -64,6 +66,8 @@ class Driver(LifecycleNode):  # type: ignore[misc]
         assert live is not None
         wanted = {*self._robot.senses.topics, self._robot.rules.episode.topic}
         wanted.add(live.watchdog.heartbeat)
+        if self._robot.rules.score is not None:
+            wanted.add(self._robot.rules.score.topic)
         return {topic for topic in wanted if topic is not None}
 
     def lacking(self) -> list[str]:
@@ -101,6 +105,9 @@ class Driver(LifecycleNode):  # type: ignore[misc]
             self._subscribe(types[topic][0], topic, self._sensed)
         if rules.episode.topic:
             self._subscribe(types[rules.episode.topic][0], rules.episode.topic, self._ended)
+        if rules.score is not None:
+            topic = rules.score.topic
+            self._subscribe(types[topic][0], topic, self._scored, self._lossless(topic))
         heartbeat = live.watchdog.heartbeat
         if heartbeat:
             self._subscribe(types[heartbeat][0], heartbeat, self._beat)
@@ -110,17 +117,29 @@ class Driver(LifecycleNode):  # type: ignore[misc]
             self._reset = self.create_client(message_class(live.reset.type), live.reset.service)
             self._robot.ask_for_reset = self._ask_for_reset
 
-    def _subscribe(self, type_name: str, topic: str, handle: Callable[..., None]) -> None:
+    def _subscribe(
+        self, type_name: str, topic: str, handle: Callable[..., None], quality: QoSProfile = SENSOR
+    ) -> None:
         def store(message: Any) -> None:
             self._link.store(handle, topic, message, self._robot.clock())
 
-        self.create_subscription(message_class(type_name), topic, store, SENSOR)
+        self.create_subscription(message_class(type_name), topic, store, quality)
+
+    def _lossless(self, topic: str) -> QoSProfile:
+        """A quality under which nothing is lost, if all who publish on a topic offer it."""
+        offered = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
+        reliable = all(q.reliability == ReliabilityPolicy.RELIABLE for q in offered)
+        kind = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        return QoSProfile(depth=SCORES_DEPTH, reliability=kind)
 
     def _sensed(self, topic: str, message: Any, now: float) -> None:
         self._robot.senses.take(topic, message, now)
 
     def _ended(self, topic: str, message: Any, now: float) -> None:
         self._robot.episode_message(message)
+
+    def _scored(self, topic: str, message: Any, now: float) -> None:
+        self._robot.score_message(topic, message, now)
 
     def _beat(self, topic: str, message: Any, now: float) -> None:
         self._robot.guard.heartbeat(now)
