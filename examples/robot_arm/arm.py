@@ -42,6 +42,11 @@ class Faults:
     stuck: float = 0.02  # times a second that a joint sticks
     stuck_for: float = 0.4  # [s]
 
+    @classmethod
+    def none(cls) -> 'Faults':
+        """Nothing goes wrong."""
+        return cls(0, 0, 0, 0, 0, 0)
+
 
 @dataclass
 class Arm:

@@ -21,6 +21,7 @@ from rclpy.node import Node
 
 from codetr_ros.config import Settings, from_canonical
 from codetr_ros.ros import qos
+from codetr_ros.ros.signing import Signed
 
 
 class Inspection(Node):
@@ -50,8 +51,8 @@ class Inspection(Node):
         settings = self._settings = from_canonical(run.settings, 'the run')
         self._run_id = run.run_id
         topic = 'composite_rewards'
-        self._scores = self.create_publisher(
-            msg.CompositeReward, topic, qos.profile(topic, settings)
+        self._publish_score = Signed(  # with the key of the run, where there is one
+            self, msg.CompositeReward, topic, qos.profile(topic, settings)
         )
         self.create_subscription(
             msg.Transitions, 'transitions', self._look, qos.profile('transitions', settings)
@@ -94,8 +95,7 @@ class Inspection(Node):
         for due, score in [each for each in self._waiting if each[0] <= now]:
             self._waiting.remove((due, score))
             score.sequence, self._sequence = self._sequence, self._sequence + 1
-            score.stamp = self.get_clock().now().to_msg()
-            self._scores.publish(score)
+            self._publish_score(score)
 
 
 def main() -> None:

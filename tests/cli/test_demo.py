@@ -3,6 +3,9 @@
 import pytest
 
 from codetr_ros import cli
+from codetr_ros.cli import demo_robot, train
+from codetr_ros.nodes import signing
+from helpers.builders import tiny
 
 
 def test_without_a_name_the_examples_are_listed(capsys):
@@ -32,3 +35,9 @@ def test_what_cannot_be_started_is_refused(flags, said, capsys, tmp_path):
     assert cli.main(['demo', 'robot', *flags, '--out', str(tmp_path / 'run')]) == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / 'run').exists()
+
+
+def test_the_inspection_of_the_robot_signs_with_the_key_that_the_nodes_of_the_run_have():
+    topics = train.Topics()
+    given = demo_robot.beside(tiny(), topics.key)
+    assert signing.key_of(given) == signing.key_of(topics.key) is not None

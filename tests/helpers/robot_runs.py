@@ -12,12 +12,14 @@ from typing import Any
 
 import yaml
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
+from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.qos import QoSProfile
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from codetr_ros.config import Settings
+from codetr_ros.nodes import signing
 from codetr_ros.processes import launcher
 from codetr_ros.runs import folder as run_folder
 from helpers import nodes
@@ -26,6 +28,12 @@ from helpers.builders import tiny
 EXAMPLE = Path(__file__).resolve().parents[2] / 'examples' / 'robot_arm'
 DRIVER = f'{nodes.NAMESPACE}/robot_driver'
 COMMANDS = '/arm/velocity_commands'
+TRANSITIONS = {
+    'configure': Transition.TRANSITION_CONFIGURE,
+    'cleanup': Transition.TRANSITION_CLEANUP,
+    'activate': Transition.TRANSITION_ACTIVATE,
+    'deactivate': Transition.TRANSITION_DEACTIVATE,
+}
 
 
 def robot_settings(**changes: Any) -> Settings:
@@ -33,7 +41,7 @@ def robot_settings(**changes: Any) -> Settings:
     small = {
         'task': 'robot/arm', 'pace': 'free', 'scorer': 'topic', 'evaluate_every': 0, 'steps': 120,
         'phase_steps': 40, 'warmup_steps': 80, 'delay': 20, 'method': 'evidence', 'requests': 0,
-        'sac.compile': False,
+        'sac.compile': False, 'scorers': ('inspection',),
     }  # fmt: skip
     return tiny(**(small | changes))
 
@@ -53,14 +61,22 @@ class RobotRun(nodes.Nodes):
     Args:
         settings: of the run.
         folder: of the run.
-        live: entries of the mapping's part `live`.
         autostart: whether the robot moves without being activated.
+        key: the key of the run; None: there is none.
+        live: entries of the mapping's part `live`.
     """
 
     def __init__(
-        self, settings: Settings, folder: Path, autostart: bool = True, **live: Any
+        self,
+        settings: Settings,
+        folder: Path,
+        autostart: bool = True,
+        key: str | None = None,
+        **live: Any,
     ) -> None:
         super().__init__(settings, folder)
+        if key is not None:
+            self._environment[signing.VARIABLE] = key
         file = mapping(folder, **live)
         robot = {'mapping': str(file), 'autostart': autostart}
         made = launcher.commands(settings, nodes.RUN_ID, folder, robot=robot)
@@ -101,7 +117,9 @@ class Person(nodes.Witness):
     def __enter__(self) -> 'Person':
         super().__enter__()
         self.commands: list[list[float]] = []
+        self.measurements = 0
         node = self.link.node
+        node.create_subscription(JointState, '/joint_states', self._measured, QoSProfile(depth=10))
         node.create_subscription(
             Float64MultiArray,
             COMMANDS,
@@ -114,22 +132,32 @@ class Person(nodes.Witness):
     def call(self, service: str, data: bool | None = None) -> Any:
         """Call a service of the robot node; its answer."""
         kind = Trigger if data is None else SetBool
+        request = kind.Request() if data is None else kind.Request(data=data)
+        return self._ask(kind, service, request)
+
+    def activate(self) -> None:
+        """Let the robot move."""
+        assert self.change('activate')
+
+    def change(self, transition: str) -> bool:
+        """Ask for a transition of the lifecycle; whether it was made."""
+        request = ChangeState.Request()
+        request.transition.id = TRANSITIONS[transition]
+        return bool(self._ask(ChangeState, 'change_state', request).success)
+
+    def state(self) -> int:
+        """The state of the lifecycle, one of those of `lifecycle_msgs/State`."""
+        return int(self._ask(GetState, 'get_state', GetState.Request()).current_state.id)
+
+    def _ask(self, kind: Any, service: str, request: Any) -> Any:
         client = self.link.node.create_client(kind, f'{DRIVER}/{service}')
         self.until(client.service_is_ready)
-        request = kind.Request() if data is None else kind.Request(data=data)
         future = client.call_async(request)
         self.until(future.done)
         return future.result()
 
-    def activate(self) -> None:
-        """Let the robot move."""
-        change = self.link.node.create_client(ChangeState, f'{DRIVER}/change_state')
-        self.until(change.service_is_ready)
-        request = ChangeState.Request()
-        request.transition.id = Transition.TRANSITION_ACTIVATE
-        future = change.call_async(request)
-        self.until(future.done)
-        assert future.result().success
+    def _measured(self, message: JointState) -> None:
+        self.measurements += 1
 
     def sees_commands(self) -> bool:
         """Whether commands would arrive here."""

@@ -7,7 +7,7 @@ import os
 import secrets
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -90,8 +90,7 @@ def _run(settings: Settings, run_id: str, folder: Path, example: Path) -> int:
     )
     with launcher.Processes(lambda text: shown.print(text, markup=False)) as processes:
         try:
-            environment = launcher.environment(settings, os.environ)
-            processes.start(others, folder / run_folder.LOGS, environment)
+            processes.start(others, folder / run_folder.LOGS, beside(settings, topics.key))
         except LaunchError as error:
             return refuse(str(error))
         code = train.train(settings, run_id, folder, topics, f'codetr demo robot ({example})')
@@ -99,6 +98,11 @@ def _run(settings: Settings, run_id: str, folder: Path, example: Path) -> int:
             shown.print(f'codetr: {"; ".join(failed)} before the run was over', markup=False)
             code = code or FAILED
     return code or _show(settings, folder)
+
+
+def beside(settings: Settings, key: Mapping[str, str]) -> dict[str, str]:
+    """The environment of robot and inspection: with the key of the run, to sign scores with."""
+    return launcher.environment(settings, os.environ) | dict(key)
 
 
 def _robot_and_inspection(

@@ -8,6 +8,7 @@ store what arrived; only a stop acts at once.
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -191,6 +192,14 @@ class Driver(LifecycleNode):  # type: ignore[misc]
         self._robot.control.reset.answered(success, getattr(answer, 'message', ''))
 
     # ---- lifecycle
+
+    # rclpy raises where a transition is not possible now, and whoever asked gets no answer
+    def _LifecycleNodeMixin__change_state(self, transition: int) -> TransitionCallbackReturn:  # noqa: N802
+        try:
+            return super()._LifecycleNodeMixin__change_state(transition)
+        except rclpy_implementation.RCLError as error:
+            self.get_logger().error(f'refused transition {transition}: {error}')
+            return TransitionCallbackReturn.FAILURE
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Drive the robot."""
