@@ -45,7 +45,7 @@ class Bench:
         next(self.work)
         self.sense()
         next(self.work)
-        self.robot.activate()
+        self.robot.driving.activate()
         self.robot.receive(policy(sources=('robot',), steps=np.array([10], np.uint32)))
 
     def sense(self) -> None:
@@ -65,7 +65,7 @@ class Bench:
 
     def score(self, value: float, at: float | None = None) -> None:
         message = SimpleNamespace(data=value) if at is None else stamped(value, at)
-        self.robot.score_message('/score', message, self.clock.now + PERIOD / 2)
+        self.robot.driving.score_message('/score', message, self.clock.now + PERIOD / 2)
         self.listen()
 
     @property
@@ -162,11 +162,11 @@ def test_a_score_that_names_its_episode_is_of_it_however_many_have_begun():
     bench = Bench(rule, more, delay='episode')
     for name in range(5):
         bench.step(7)
-        bench.robot.episode_message(SimpleNamespace(data=name))
+        bench.robot.driving.episode_message(SimpleNamespace(data=name))
         bench.step(1)
         if name == 1:
             message = SimpleNamespace(name=0, value=9.0)
-            bench.robot.score_message('/score', message, bench.clock.now)
+            bench.robot.driving.score_message('/score', message, bench.clock.now)
     bench.step(20)
     assert bench.scores == [(0, 0, 7, 9.0)]
 
@@ -175,7 +175,9 @@ def test_scores_that_cannot_be_read_or_used_are_counted_and_given_to_nobody(capl
     bench = Bench({'of': 'since_last', 'field': 'value'})
     bench.step(5)
     bench.score(1.0)
-    bench.robot.score_message('/score', SimpleNamespace(value=float('nan')), bench.clock.now)
+    bench.robot.driving.score_message(
+        '/score', SimpleNamespace(value=float('nan')), bench.clock.now
+    )
     bench.step(10)
     assert bench.scores == []
     assert bench.count(live_scores.UNREADABLE) == 1
@@ -199,6 +201,6 @@ def test_a_mapping_whose_scores_the_run_cannot_take_is_refused(score, settings, 
 
 def test_where_others_are_named_as_scorers_the_score_topic_is_left_alone():
     bench = Bench({}, scorers=('inspection',))
-    assert bench.robot.rules.score is None
+    assert bench.robot.driving.rules.score is None
     bench.step(30)
     assert bench.scores == []

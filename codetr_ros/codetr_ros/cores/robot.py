@@ -111,9 +111,7 @@ class Robot(Part):
         self._name = name
         self._log = StepLog(run.run_id, name, settings.steps_of)
         rules = scoring(rules, settings, name)
-        self._scores = LiveScores(
-            rules, run.run_id, name, settings.cuts, lambda: self._log.phase
-        )
+        self._scores = LiveScores(rules, run.run_id, name, settings.cuts, lambda: self._log.phase)
         self.driving = Driving(rules, self, self._log, clock, self._scores)
         self.senses, self.control = self.driving.senses, self.driving.control
         self._permitted: dict[int, tuple[Policy, ActingPolicy | None]] = {}
