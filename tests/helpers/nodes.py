@@ -4,6 +4,7 @@ namespace that hears everything and can say anything.
 
 import json
 import os
+import re
 import signal
 import time
 from collections.abc import Callable, Collection, Iterator
@@ -17,8 +18,9 @@ from domain_coordinator import domain_id
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.signals import SignalHandlerOptions
 
-from codetr_ros.bags.definitions import decode
+from codetr_ros.bags.definitions import decode_sent
 from codetr_ros.config import Settings
+from codetr_ros.nodes.signing import VARIABLE, is_signed, key_of
 from codetr_ros.processes import launcher
 from codetr_ros.records import TOPICS, Commit, CompositeReward, Presence, Record, RecordError
 from codetr_ros.records.roles import published_by
@@ -53,16 +55,22 @@ class Nodes:
         settings: of the run.
         folder: of the run.
         start: starts them: forked, or `launcher.start_program`.
+        key: that of the run, as its environment variable has it; None: there is none.
     """
 
     def __init__(
-        self, settings: Settings, folder: Path, start: launcher.Start = forked.start_program
+        self,
+        settings: Settings,
+        folder: Path,
+        start: launcher.Start = forked.start_program,
+        key: str | None = None,
     ) -> None:
         self.settings = settings
+        self.key = key
         self.folder = run_folder.create(folder)
         run_folder.write_settings(folder, settings)
         self._commands = {c.name: c for c in launcher.commands(settings, RUN_ID, folder)}
-        self._environment = launcher.environment(settings)
+        self._environment = launcher.environment(settings) | ({VARIABLE: key} if key else {})
         self._processes = launcher.Processes(print, start_program=start)
         self.names = tuple(self._commands)
 
@@ -100,6 +108,14 @@ class Nodes:
         """Exit codes by name, None for those that run."""
         return {node.name: node.code for node in self._processes.nodes}
 
+    def memory(self) -> dict[str, int]:
+        """Resident memory [bytes] of the nodes that run, by name."""
+        found = {}
+        for node in self._processes.running():
+            text = Path(f'/proc/{node.process.pid}/status').read_text()
+            found[node.name] = 1024 * int(re.findall(r'VmRSS:\s+(\d+) kB', text)[0])
+        return found
+
     def wait(self, *names: str) -> dict[str, int | None]:
         """Wait until nodes have ended, all of them if none is named; their exit codes."""
         end = time.monotonic() + PATIENCE
@@ -124,14 +140,6 @@ class Nodes:
         self._processes.kill(self._processes.running())
 
 
-def sound(kind: type, data: bytes) -> list[Any]:
-    """The record in the bytes of a message; nothing if they are none."""
-    try:
-        return [decode(kind, data)]
-    except RecordError:
-        return []
-
-
 class Witness:
     """A node in the namespace of the run that is no part of it.
 
@@ -153,7 +161,7 @@ class Witness:
         )
         self.link = Link('witness')
         self.link.subscribe(Presence, self._hear)
-        self.link.subscribe(Commit, lambda kind, data: self.commits.extend(sound(kind, data)))
+        self.link.subscribe(Commit, self._committed)
         self.link.subscribe(CompositeReward, self._scored)
         self.link.node.create_subscription(
             DiagnosticArray,
@@ -167,12 +175,26 @@ class Witness:
         self.link.close()
         rclpy.try_shutdown()
 
+    def sound(self, kind: type, data: bytes) -> list[Any]:
+        """The record in the bytes of a message of a node of the run; nothing if they are none."""
+        key = key_of({VARIABLE: self._nodes.key or ''})
+        if key is not None and not is_signed(key, self.link.topic(kind), data):
+            return []
+        try:
+            record, sender = decode_sent(kind, data)
+        except RecordError:
+            return []
+        return [] if sender == self.link.instance else [record]
+
     def _hear(self, kind: type, data: bytes) -> None:
-        for said in sound(kind, data):
+        for said in self.sound(kind, data):
             self.presence[said.node.rsplit('/', 1)[1]] = said
 
+    def _committed(self, kind: type, data: bytes) -> None:
+        self.commits.extend(self.sound(kind, data))
+
     def _scored(self, kind: type, data: bytes) -> None:
-        self.scores.extend(sound(kind, data))
+        self.scores.extend(self.sound(kind, data))
 
     def _diagnosed(self, array: DiagnosticArray) -> None:
         for status in array.status:

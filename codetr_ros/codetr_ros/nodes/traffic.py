@@ -255,7 +255,7 @@ class Traffic:
         if self.receive(record) and not isinstance(record, Commit):
             self.recovered[TOPICS[type(record)]] += 1
 
-    def refuse(self, what: type | str, error: RecordError) -> None:
+    def refuse(self, what: type | str, error: Exception) -> None:
         """Count a refusal; log the first ten on a topic, then every thousandth.
 
         Args:

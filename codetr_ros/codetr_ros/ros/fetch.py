@@ -1,7 +1,13 @@
 """Asks other nodes for phases again: the recorder for a committed one, any other for what it has
 published.
+
+With a key of the run, each answer is signed, for one request alone. Whoever else answers is
+refused and counted, and the true answer is waited for: the middleware hands over all of them.
 """
 
+import hmac
+import json
+import secrets
 import time
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
@@ -11,6 +17,7 @@ import numpy as np
 from codetr_msgs.srv import FetchPhase
 
 from codetr_ros.nodes.fetching import AGAIN
+from codetr_ros.nodes.signing import signature
 from codetr_ros.records import RecordError
 from codetr_ros.records.fields import RECORD_TYPES
 from codetr_ros.records.shown import shown
@@ -39,6 +46,22 @@ class Answer:
     phase: int | None
     reason: str = ''
     messages: list[tuple[type, bytes]] = field(default_factory=list)
+
+
+def answer_signature(key: bytes, service: str, request: Any, response: Any) -> bytes:
+    """The signature of an answer, which fits one request alone.
+
+    Args:
+        key: that of the run.
+        service: its full name.
+        request: of type `FetchPhase.Request`.
+        response: of type `FetchPhase.Response`.
+    """
+    asked = [request.run_id, request.phase, list(request.kinds), request.part]
+    answered = [response.found, response.reason, list(response.types), list(response.lengths)]
+    numbers = [response.phase, response.parts]
+    text = json.dumps([bytes(request.nonce).hex(), asked, answered, numbers])
+    return signature(key, service, text.encode() + b'\0' + bytes(response.cdr))
 
 
 def unpack(response: Any) -> Iterator[tuple[type, bytes]]:
@@ -77,6 +100,8 @@ class Asker:
         self._link = link
         self._run_id = run_id
         self._client = link.node.create_client(FetchPhase, service)
+        self._full_name = link.node.resolve_service_name(service)
+        self._pending: Any = None  # the future of the last request
         self._question = 0  # the number of the present one
         self._asked_at: float | None = None  # when the last part was asked for
 
@@ -116,14 +141,49 @@ class Asker:
             requester=self._link.full_name,
             kinds=list(question.kinds),
             part=question.part,
+            nonce=np.frombuffer(secrets.token_bytes(16), np.uint8),
         )
-        future = self._client.call_async(request)
-        future.add_done_callback(lambda done: self._link.store(self._arrived, question, done))
+        self._forget()
+        self._pending = self._client.call_async(request)
+        # the future stays pending: with the first answer, the middleware would drop all others
+        self._pending.set_result = lambda response: self._link.store(
+            self._arrived, question, request, response
+        )
 
-    def _arrived(self, question: '_Question', done: Any) -> None:
+    def _forget(self) -> None:
+        """Take no answer to the last request any more."""
+        if self._pending is not None:
+            self._client.remove_pending_request(self._pending)
+            self._pending = None
+
+    def _check(self, request: Any, response: Any) -> None:
+        """Refuse an answer that is not signed with the key of the run, if there is one.
+
+        Raises:
+            RecordError: it is not.
+        """
+        key = self._link.key
+        if key is None:
+            return
+        own = answer_signature(key, self._full_name, request, response)
+        if not hmac.compare_digest(own, bytes(response.signature)):
+            raise RecordError(
+                f'an answer of {self._full_name!r} to the question for phase {request.phase} is '
+                'not signed with the key of this run: look for a second node that offers this '
+                'service'
+            )
+
+    def _arrived(self, question: '_Question', request: Any, response: Any) -> None:
         if question.number != self._question or self._asked_at is None:
             return
-        response = done.result()
+        if question.part != request.part:
+            return  # a second answer for a part that has come
+        try:
+            self._check(request, response)
+        except RecordError as error:
+            self._link.refuse(SERVICE, error)
+            return
+        self._forget()
         if not response.found:
             self._asked_at = None
             question.answered(Answer(None, shown(response.reason) or 'no reason is given'))

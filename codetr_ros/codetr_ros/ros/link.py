@@ -21,7 +21,7 @@ from codetr_ros.bags.definitions import encode
 from codetr_ros.config import Settings
 from codetr_ros.nodes.signing import key_of, signed
 from codetr_ros.records import TOPICS, Record
-from codetr_ros.records.shown import shown, worth_a_line
+from codetr_ros.records.shown import shown
 from codetr_ros.ros import messages, qos
 from codetr_ros.ros.plots import Plots
 from codetr_ros.ros.signing import new_instance
@@ -29,6 +29,11 @@ from codetr_ros.ros.signing import new_instance
 UNDECODABLE = (rclpy_implementation.RCLError, rclpy_implementation.RMWError, UnicodeDecodeError)
 """What the executor raises for a request, or an answer, that is none. Callbacks of ours only store
 what arrived, and raise nothing.
+"""
+
+SERVICES = 'services'
+"""The name under which requests and answers that cannot be decoded are counted: the middleware
+does not name their service.
 """
 
 RECORDS_OF_TOPIC = {topic: record_type for record_type, topic in TOPICS.items()}
@@ -40,6 +45,7 @@ class Link:
     Attributes:
         instance: id of this start of the node, the sender of all its messages.
         key: with which they are signed; None: not at all.
+        refuse: counts and logs what is refused of services, by the name of the service.
 
     Args:
         name: the node's name unless it is remapped.
@@ -59,7 +65,7 @@ class Link:
         self._events = 0
         self.inbox: deque[Callable[[], None]] = deque()
         self.published: Counter[str] = Counter()
-        self.undecodable = 0  # requests and answers of services
+        self.refuse: Callable[[str, Exception], None] = self._log_refusal
 
     @property
     def full_name(self) -> str:
@@ -182,12 +188,10 @@ class Link:
                 if self._events == seen:
                     return
         except UNDECODABLE as error:
-            self.undecodable += 1
-            if worth_a_line(self.undecodable):
-                self.node.get_logger().error(
-                    f'undecodable message to a service (number {self.undecodable}): '
-                    f'{shown(str(error))}'
-                )
+            self.refuse(SERVICES, RuntimeError(f'undecodable message: {shown(str(error))}'))
+
+    def _log_refusal(self, what: str, error: Exception) -> None:
+        self.node.get_logger().error(f'refused on {what!r}: {error}')
 
     def handle(self, wait: float = 0.0) -> None:
         """Handle everything that has arrived, in the main loop.

@@ -92,6 +92,7 @@ class Membership:
         self.peers = Peers(role)
         admission = Admission(self.link.topic, self.link.key, self._silence)
         self.traffic = Traffic(self.log, admission=admission)
+        self.link.refuse = self.traffic.refuse
         self.company: list[Membership] = []
         self.values: dict[str, Any] = {}
         self.run: RunSpec | None = None

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Collection, Iterable
 
+import numpy as np
 from codetr_msgs.srv import FetchPhase
 
 from codetr_ros.bags.errors import BagError
@@ -9,7 +10,7 @@ from codetr_ros.nodes.last_phases import LastPhases
 from codetr_ros.nodes.outbox import Outbox
 from codetr_ros.records.fields import type_name
 from codetr_ros.records.shown import shown
-from codetr_ros.ros.fetch import SERVICE, service_of
+from codetr_ros.ros.fetch import SERVICE, answer_signature, service_of
 from codetr_ros.ros.link import Link
 
 PART_BYTES = 4_000_000
@@ -43,12 +44,23 @@ class PhaseService:
         newest: Callable[[], int | None],
     ) -> None:
         self._who = link.full_name
+        self._key = link.key
+        self._full_name = link.node.resolve_service_name(service)
         self._log = link.node.get_logger()
         self._run_id = run_id
         self._read = read
         self._newest = newest
         self._sent: dict[str, int] = {}  # the phase that was sent last, by requester
-        link.node.create_service(FetchPhase, service, self._send)
+        link.node.create_service(FetchPhase, service, self._answer)
+
+    def _answer(
+        self, request: FetchPhase.Request, response: FetchPhase.Response
+    ) -> FetchPhase.Response:
+        response = self._send(request, response)
+        if self._key is not None:
+            sign = answer_signature(self._key, self._full_name, request, response)
+            response.signature = np.frombuffer(sign, np.uint8)
+        return response
 
     def _send(
         self, request: FetchPhase.Request, response: FetchPhase.Response

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from itertools import chain
 from typing import Any
 
-from codetr_ros.bags.definitions import decode
 from codetr_ros.nodes.errors import NodeError
 from codetr_ros.records import (
     INITIAL_VERSION,
@@ -46,7 +45,7 @@ class _Recorder:
 
         Raises:
             NodeError: the recorder refuses to send it, or does not answer.
-            RecordError: a message cannot be decoded.
+            RecordError: a message cannot be decoded, is out of bounds or not signed.
         """
         answers: list[Answer] = []
         names = [type_name(kind) for kind in kinds]
@@ -65,7 +64,8 @@ class _Recorder:
                 f'{self._member.link.full_name} joins a run that has begun, and the recorder does '
                 f'not send phase {phase}: {answer.reason}'
             )
-        return answer.phase, [decode(kind, data) for kind, data in answer.messages]
+        fetched = self._member.traffic.fetched
+        return answer.phase, [fetched(kind, data) for kind, data in answer.messages]
 
 
 def go_on(member: Membership, joined: Joined) -> bool:
