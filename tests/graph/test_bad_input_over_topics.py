@@ -14,9 +14,18 @@ pytest.importorskip('rclpy', reason='needs ROS')
 
 from codetr_ros.config import Settings
 from codetr_ros.policy.actor import Actor, describe_network, weights_bytes
-from codetr_ros.records import TOPICS, CompositeReward, Policy, Presence, Record
+from codetr_ros.records import (
+    TOPICS,
+    Commit,
+    CompositeReward,
+    Policy,
+    Presence,
+    Record,
+    StepRewards,
+)
+from codetr_ros.records.digests import digest
 from codetr_ros.records.roles import read_by
-from helpers.builders import policy, score, tiny, transitions
+from helpers.builders import commit, policy, score, step_rewards, tiny, transitions
 from helpers.nodes import Nodes, Witness, domain
 from helpers.runs import finish, start, write
 
@@ -46,6 +55,31 @@ def of_another_architecture(settings: Settings) -> Policy:
         network=describe_network(OBSERVATION + 1, ACTION, hidden),
         weights=weights_bytes(Actor(OBSERVATION + 1, ACTION, hidden)),
     )
+
+
+MADE_UP = 'ab' * 32
+
+
+def early_commits(newest: Commit) -> list[Commit]:
+    """Commits of the phase under way: one that names nothing, and one that follows on the newest
+    and differs from what will come.
+    """
+    names, numbers = (), np.empty(0, np.int64)
+    empty = {'sources': names, 'transitions': numbers, 'scorers': names, 'scores': numbers}
+    following = replace(
+        newest,
+        phase=newest.phase + 1,
+        previous=digest(newest),
+        transitions=newest.transitions + 1,
+        transition_digests=(MADE_UP,),
+    )
+    return [commit(phase=newest.phase + 1, **empty), following]
+
+
+def early_labels(newest: Commit) -> list[StepRewards]:
+    """Labels, complete, of the newest phase and of that under way."""
+    phases = newest.phase, newest.phase + 1
+    return [step_rewards(phase=phase, commit=MADE_UP) for phase in phases]
 
 
 def another_permission() -> Policy:
@@ -115,6 +149,8 @@ def outcome(tmp_path_factory):
         witness.say(*bad_transitions())
         witness.say(*bad_scores(witness.scores[0]))
         witness.say(policy())  # the very policy of before
+        witness.say(*early_commits(witness.commits[-1]))
+        witness.say(*early_labels(witness.commits[-1]))
         witness.say(another_permission(), of_another_architecture(settings))
         witness.until(lambda: set(nodes.names) <= witness.readers('presence'))
         witness.say_bytes(*JUNK.items())
@@ -251,6 +287,28 @@ def test_a_phase_that_is_permitted_again_otherwise_is_refused(outcome):
     assert 'phase 0 has 200: stop the second learner' in said
 
 
+@pytest.mark.parametrize('node', ['reward', 'learner'])
+def test_early_commits_are_refused_without_a_key_too(outcome, node):
+    """A commit is compared with what it names, whoever publishes it."""
+    log = outcome.nodes.log(node)
+    assert 'names no sources, and every phase has steps' in log or (
+        'is the newest that can have been permitted' in log
+    )
+    assert re.search(
+        r'refused later \(number \d+\): Commit\(phase=\d+\) is not the one whose digests the '
+        r'records have|is the newest that can have been permitted',
+        log,
+    )
+
+
+def test_early_labels_are_refused_without_a_key_too(outcome):
+    """They are made of no commit, and nobody knows the digest of a commit that is to come."""
+    assert re.search('made of (no|the) commit', outcome.nodes.log('learner'))
+    log = outcome.nodes.log('record')
+    assert f'was made of the commit {MADE_UP!r}' in log
+    assert 'is the next to be committed: stop what publishes them' in log
+
+
 def test_every_refusal_is_counted_in_the_report_of_the_node(outcome):
     refused = {name: outcome.nodes.report(name)['refused'] for name in outcome.nodes.names}
     junk = {
@@ -261,10 +319,12 @@ def test_every_refusal_is_counted_in_the_report_of_the_node(outcome):
     assert refused == {
         'sim': junk['sim'] + Counter({'policy': 2}),
         'evaluate': junk['evaluate'] + Counter({'policy': 1}),
-        'reward': junk['reward'] + Counter({'transitions': 5, 'composite_rewards': 4}),
-        'learner': junk['learner'] + Counter({'transitions': 5, 'run': 1}),
+        'reward': junk['reward']
+        + Counter({'transitions': 5, 'composite_rewards': 4, 'commits': 2}),
+        'learner': junk['learner']
+        + Counter({'transitions': 5, 'run': 1, 'commits': 2, 'step_rewards': 2}),
         'record': junk['record']
-        + Counter({'transitions': 5, 'composite_rewards': 2, 'policy': 2}),
+        + Counter({'transitions': 5, 'composite_rewards': 2, 'policy': 2, 'step_rewards': 2}),
     }
 
 

@@ -39,8 +39,8 @@ pytestmark = pytest.mark.slow
 ROUNDS, LIES_IN_A_ROUND, LARGE_IN_A_ROUND = 4, 100, 12
 """The large ones have a megabyte. In a round, fewer are on a topic than its queues hold."""
 MOST_GROWTH = 16 << 20
-"""How many bytes of memory a node may take more from the second round on, in which 36 megabytes are
-told: it keeps nothing of them. In the first round the middleware takes room for such messages.
+"""How many bytes of memory a node may take more from the second round on, in which 36 megabytes
+are told: it keeps nothing of them. In the first round the middleware takes room for such messages.
 """
 HEARD = (
     RunSpec, Presence, TaskSpec, Policy, Transitions, CompositeReward, Commit, StepRewards,

@@ -150,7 +150,7 @@ class Liar(Witness):
         return decode_sent(kind, self._heard[kind][-1])[1] if self.heard(kind) else ''
 
     def _again(self, kind: type) -> bytes:
-        """A message that was heard: as it came, later than it was, altered, or on another topic."""
+        """A message that was heard: as it came, later, altered, or that of another topic."""
         if not self.heard(kind):
             return self._junk()
         data = self.rng.choice(self._heard[kind])
@@ -281,8 +281,8 @@ LIES: dict[type, Callable[[Liar, random.Random], Record | None]] = {
     RunSpec: Liar.run,
     Presence: Liar.presence,
     Policy: Liar.policy,
-    EpisodeResult: lambda liar, rng: liar._of_those_heard(EpisodeResult, true_return=1e9),  # noqa: SLF001
-    TrueRewards: lambda liar, rng: liar._of_those_heard(TrueRewards, phase=rng.randrange(9)),  # noqa: SLF001
+    EpisodeResult: lambda liar, rng: liar._of_those_heard(EpisodeResult, true_return=1e9),
+    TrueRewards: lambda liar, rng: liar._of_those_heard(TrueRewards, phase=rng.randrange(9)),
     Metrics: lambda liar, rng: metrics('run', rng.choice(ROLES), 'sim', 0, 0, {'loss': 1e9}),
 }
 """What is made up on each topic; on others, junk is published."""
