@@ -4,7 +4,8 @@
 
 It receives the steps of the run and looks at where the hand was. For each segment that is over it
 publishes one number, how near the hand was to the target on the whole, some seconds later. Some
-segments it never scores.
+segments it never scores. What was lost on the way, because the recorder was started again, it
+publishes once more.
 """
 
 import argparse
@@ -42,6 +43,8 @@ class Inspection(Node):
         self._scored: defaultdict[int, int] = defaultdict(int)  # steps that have had their score
         self._waiting: list[tuple[float, msg.CompositeReward]] = []  # in order of their time
         self._sequence = self.skipped = 0
+        self._open: list[msg.CompositeReward] = []  # that no commit has named
+        self._before = 0  # scores that had been published when the last commit came
         self.create_subscription(msg.RunSpec, 'run', self._run, qos.profile('run'))
         self.create_timer(0.05, self._publish)
 
@@ -57,6 +60,18 @@ class Inspection(Node):
         self.create_subscription(
             msg.Transitions, 'transitions', self._look, qos.profile('transitions', settings)
         )
+        self.create_subscription(
+            msg.Commit, 'commits', self._committed, qos.profile('commits', settings)
+        )
+
+    def _committed(self, commit: msg.Commit) -> None:
+        """A commit names what has reached the recorder: publish again what was lost before."""
+        named = dict(zip(commit.scorers, commit.scores, strict=True)).get(self.get_name(), -1)
+        self._open = [score for score in self._open if score.sequence > named]
+        for score in self._open:
+            if score.sequence < self._before:
+                self._publish_score(score)
+        self._before = self._sequence
 
     def _look(self, steps: msg.Transitions) -> None:
         settings = self._settings
@@ -96,6 +111,7 @@ class Inspection(Node):
             self._waiting.remove((due, score))
             score.sequence, self._sequence = self._sequence, self._sequence + 1
             self._publish_score(score)
+            self._open.append(score)
 
 
 def main() -> None:

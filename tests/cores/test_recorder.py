@@ -5,7 +5,8 @@ import pytest
 
 from codetr_ros.cores.recorder import Recorder
 from codetr_ros.records import Commit, RecordError
-from helpers.builders import policy, run, score, task_spec, tiny, transitions
+from codetr_ros.records.digests import digest
+from helpers.builders import policy, run, score, step_rewards, task_spec, tiny, transitions
 
 
 def recorder(**changes) -> Recorder:
@@ -140,6 +141,21 @@ def test_scores_that_a_robot_gives_itself_join_the_next_commit_like_those_of_any
         r.receive(transitions(sequence=phase, phase=phase, **steps))
         (made,) = commits(r, work)
         assert (made.scorers, made.scores.tolist()) == (('sim',), [phase])
+
+
+def test_labels_of_a_free_run_that_overtake_those_of_a_phase_before_come_early():
+    """A recorder that was killed gets the newest at once, and has to ask for those before."""
+    r = recorder(task='robot/arm', pace='free', evaluate_every=0, scorer='topic')
+    work = r.work()
+    made = []
+    for phase in range(2):
+        steps = {'first_step': 200 * phase, 'steps': 200, 'phase_end': True}
+        r.receive(transitions(sequence=phase, phase=phase, **steps))
+        made += commits(r, work)
+    first, second = (step_rewards(phase=n, commit=digest(made[n])) for n in range(2))
+    assert r.comes_early(second) and not r.comes_early(first)
+    r.receive(first)
+    assert not r.comes_early(second)
 
 
 def test_a_free_robot_may_be_phases_ahead_of_the_permission_that_arrives():

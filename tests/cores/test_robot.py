@@ -1,5 +1,6 @@
 """The robot's part of a run: which policy acts at which step, and when it waits."""
 
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from codetr_ros.config import SettingsError
 from codetr_ros.cores.robot import Robot
 from codetr_ros.learners import registry
+from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.policy.actor import weights_bytes
 from codetr_ros.records import Metrics, Policy, RecordError, TaskSpec, Transitions
 from helpers.builders import policy, run, tiny
@@ -199,3 +201,53 @@ def test_a_clock_that_is_set_back_cuts_the_episode_and_control_goes_on():
     counters = bench.robot.report().counters
     assert counters['times that the clock went back'] == 1
     assert 'control deadlines missed' not in counters
+
+
+@pytest.mark.parametrize('given_out', [3, 4, 7])
+def test_one_that_was_killed_goes_on_behind_what_was_recorded_in_an_episode_of_its_own(given_out):
+    before = Bench({'episode_steps': 6}, pace='free')
+    before.permit(0)
+    while sum(r.steps for r in before.of(Transitions)) < given_out:
+        before.step()
+    recorded = before.of(Transitions)
+    done = sum(r.steps for r in recorded)
+
+    after = Bench({'episode_steps': 6}, pace='free')
+    after.robot.restore(recorded)
+    after.permit(done // 4)
+    after.step(6)
+    first = after.of(Transitions)[0]
+    assert first.sequence == len(recorded)
+    assert (first.episode, first.first_step) == (recorded[-1].episode + 1, 0)
+    assert first.phase == done // 4
+    memory = Trajectories(4, 2, delay=5, capacity=100, margin=20, cuts=after.settings.cuts)
+    for record in (*recorded, *after.of(Transitions)):
+        memory.append(record)
+    ends = Counter()
+    for record in (*recorded, *after.of(Transitions)):
+        ends[record.phase] += record.steps
+        assert record.phase_end == (ends[record.phase] == 4)
+    assert after.robot.report().counters['times that the node was started again'] == 1
+
+
+def test_one_that_was_killed_takes_a_policy_that_comes_before_the_first_observation():
+    settings = Bench(pace='free').settings
+    robot = Robot(run(settings), settings, 'robot', rules(), Clock())
+    work = robot.work()
+    assert next(work) is None
+    newest = policy(sources=('robot',), steps=np.array([4], np.uint32), phase=3, version=2)
+    robot.receive(newest)
+    robot.senses.take('/joint_states', joints(), robot.driving.clock())
+    next(work)
+    robot.driving.activate()
+    next(work)
+    assert robot.versions == {2: 1}
+
+
+def test_a_policy_that_a_learner_publishes_again_is_counted_and_another_refused():
+    bench = Bench()
+    bench.permit(0)
+    bench.permit(0)
+    assert bench.robot.report().duplicated == {'policy': 1}
+    with pytest.raises(RecordError, match='each phase must be permitted once'):
+        bench.permit(0, seed=3)

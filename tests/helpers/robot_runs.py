@@ -105,6 +105,13 @@ class RobotRun(nodes.Nodes):
         lines = (self.folder / 'truth.jsonl').read_text().splitlines()
         return [json.loads(line) for line in lines]
 
+    def kill(self, name: str) -> None:
+        """Kill a node, and start it again with what it had."""
+        (node,) = [node for node in self._processes.nodes if node.name == name]
+        os.kill(node.process.pid, signal.SIGKILL)
+        node.process.wait(nodes.PATIENCE)
+        self._processes.start_again(node)
+
     def end(self, name: str, number: signal.Signals) -> None:
         """Send a signal to one process."""
         (node,) = [node for node in self._processes.nodes if node.name == name]

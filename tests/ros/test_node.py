@@ -85,7 +85,9 @@ def test_a_committed_phase_is_sent_again_and_another_refused_with_the_reason(pla
         assert set(records) == {'Transitions', 'CompositeReward', 'Commit'}
         again = records['Transitions'].observations
         assert again.tobytes() == transitions().observations.tobytes()
-        assert ask(run_id='run', phase=1).reason == 'phase 1 is not in memory; these are: 0'
+        begun = ask(run_id='run', phase=1)  # nothing has come of it yet
+        assert (begun.found, begun.parts, len(begun.types)) == (True, 1, 0)
+        assert ask(run_id='run', phase=2).reason == 'phase 2 is not in memory; these are: 0'
         assert "not 'other'" in ask(run_id='other', phase=0).reason
         node.send_signal(signal.SIGTERM)
         said = output(node)

@@ -24,6 +24,9 @@ class RecordedLabels:
         self._first = FirstLabels(settings) if settings.record_relabels == 'first' else None
         self._restored: dict[tuple[int, int], StepRewards] = {}  # what a bag has of them
         self._last: tuple[StepRewards, StepRewards] | None = None  # taken, and what is kept of it
+        self._lacks: dict[int, set[int]] = {}  # parts that are still to come, by phase
+        self.due = 0
+        """The first phase whose labels are not all there."""
 
     @property
     def reduced(self) -> bool:
@@ -66,12 +69,21 @@ class RecordedLabels:
         if (part.phase, part.part) in self._digests:
             return False
         self._digests[part.phase, part.part] = digest
+        self._arrived(part)
         kept = self._restored.pop((part.phase, part.part), None)
         if kept is None and self._first is not None:
             kept = self._first.keep(part)
         self._last = None if kept is None else (part, kept)
         self._chain.note(part, kept)
         return True
+
+    def _arrived(self, part: StepRewards) -> None:
+        if part.phase < self.due:
+            return
+        self._lacks.setdefault(part.phase, set(range(part.parts))).discard(part.part)
+        while self._lacks.get(self.due) == set():
+            del self._lacks[self.due]
+            self.due += 1
 
     def kept(self, part: StepRewards) -> StepRewards:
         """What the bag keeps of labels that have just been taken."""
@@ -82,6 +94,7 @@ class RecordedLabels:
         if self._first is not None:
             self._first.keep(part)
         self._restored[part.phase, part.part] = part
+        self._arrived(part)
 
     def follow(self, phase: int) -> None:
         """Go on behind the commit of a phase, the last that the chain has followed."""

@@ -257,6 +257,8 @@ class Recorder(Part):
             due = self._transitions[record.source]
         elif isinstance(record, CompositeReward) and not self._settings.scored_elsewhere:
             due = self._scores[record.scorer]
+        elif isinstance(record, StepRewards) and self._settings.free:
+            return record.phase > self._labels.due  # no commit waits for those before it
         else:
             return False
         most = (self._settings.ahead + 1) * self._settings.phase_steps

@@ -7,8 +7,8 @@ arrives is used from the next control step on: nothing changes within one.
 """
 
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +21,8 @@ from codetr_ros.records import (
     F32,
     INITIAL_VERSION,
     PROTOCOL_VERSION,
+    Commit,
+    CompositeReward,
     Metrics,
     Policy,
     Record,
@@ -31,6 +33,7 @@ from codetr_ros.records import (
     describe,
     metrics,
 )
+from codetr_ros.records.digests import digest
 from codetr_ros.records.roles import subscribed
 from codetr_ros.robots import mapping
 from codetr_ros.robots.driving import Driving
@@ -118,6 +121,10 @@ class Robot(Part):
         self._now: tuple[Policy, ActingPolicy | None] | None = None  # under which it acts
         self._newest: tuple[Policy, ActingPolicy | None] | None = None
         self._last: Policy | None = None  # the one that permits nothing more
+        self._early: deque[Policy] = deque(maxlen=settings.ahead + 1)  # before the robot is known
+        self._known: dict[int, str] = {}  # digests of those that have permitted a phase
+        self._first = 0  # phase of this process: those before it were another's
+        self._restarted = False
         self.versions: Counter[int] = Counter()  # steps begun under each policy
 
     # ---- records
@@ -148,8 +155,12 @@ class Robot(Part):
                 f'{describe(policy)} names sources={list(policy.sources)}, not {self._name!r}: '
                 'stop the other robot or simulator'
             )
-        if not self.senses.size:
-            raise RecordError(f'{describe(policy)} comes before {self._name!r} is announced')
+        if not self.senses.size:  # a node before this one was announced: it was killed
+            self._early.append(policy)
+            return
+        self._take(policy)
+
+    def _take(self, policy: Policy) -> None:
         made = policy, acting_policy(policy, self.stage, self._settings)
         if self._settings.free:
             if self._newest is None or policy.phase > self._newest[0].phase:
@@ -157,12 +168,39 @@ class Robot(Part):
             else:
                 self.duplicated['policy'] += 1
             return
+        if policy.phase < self._first or self._known.get(policy.phase) == digest(policy):
+            self.duplicated['policy'] += 1  # of a robot, or a learner, that was started again
+            return
         if policy.phase < self._log.phase or policy.phase in self._permitted:
             raise RecordError(
                 f'{describe(policy)}: {self._name!r} has phase={policy.phase} already: each phase '
                 'must be permitted once. Stop the second learner, if there is one'
             )
         self._permitted[policy.phase] = made
+        self._known[policy.phase] = digest(policy)
+
+    def restore(self, records: Sequence[Record]) -> None:
+        """Go on behind what a node of this name has published before it was killed.
+
+        A robot cannot be set back. Its episode is over, and the steps that it took since then are
+        nobody's.
+
+        Args:
+            records: transitions, scores and commits of the last committed phase, then all since.
+        """
+        self._log.restore(record for record in records if isinstance(record, Transitions))
+        self._first = self._log.phase
+        self._restarted = bool(records)
+        for record in records:
+            if isinstance(record, CompositeReward) and record.scorer == self._name:
+                self._scores.resume(record.sequence + 1)
+            elif isinstance(record, Commit) and self._name in record.scorers:
+                last = int(record.scores[record.scorers.index(self._name)])
+                self._scores.resume(last + 1)
+
+    def begun(self) -> str:
+        """How far the run has come, in words."""
+        return f'phase {self._log.phase}, {self._log.total} steps are taken'
 
     def _spec(self) -> TaskSpec:
         stage, r_max = self.stage, self._settings.r_max
@@ -185,6 +223,8 @@ class Robot(Part):
         while not self.senses.size:
             yield None
         yield [self._spec()]
+        while self._early:
+            self._take(self._early.popleft())
         self.driving.begin()
         while not self.finished:
             yield self._given(self.driving.step()) or None
@@ -262,6 +302,7 @@ class Robot(Part):
         """Counts for the run's summary."""
         counters = self.driving.counts() + self._scores.report()
         counters['steps'] = self._log.total
+        counters['times that the node was started again'] = self._restarted
         counters['policies used'] = len(self.versions)
         return CoreReport(
             duplicated=dict(self.duplicated), counters={k: n for k, n in counters.items() if n}

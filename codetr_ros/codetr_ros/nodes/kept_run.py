@@ -58,7 +58,8 @@ class KeptRun:
         self._phase_steps = phase_steps
         self._writer: McapWriter | None = None
         self._phases = Phases()
-        self._last = LastPhases(phases)
+        # beside a bag only what no commit names yet: a robot that was killed asks for it
+        self._last = LastPhases(phases if folder is None else 0)
         self._evaluations: dict[int, list[bytes]] = defaultdict(list)  # results, by version
         self._flushes = Flushes()
 
@@ -129,11 +130,10 @@ class KeptRun:
         self._note(record, data)
 
     def _note(self, record: Record, data: bytes) -> None:
-        if self.folder is None:
-            if isinstance(record, Commit):
-                self._last.commit(record, data)
-            else:
-                self._last.hold(record, data)
+        if isinstance(record, Commit):
+            self._last.commit(record, data)
+        else:
+            self._last.hold(record, data)
         if isinstance(record, EpisodeResult) and record.purpose != 'training':
             phase = phase_of(record, self._phase_steps)
             assert phase is not None
@@ -167,7 +167,8 @@ class KeptRun:
 
     def read(self, phase: int, kinds: Collection[str] = ()) -> Iterable[tuple[type, bytes]]:
         """Kind and bytes of each message of a committed phase, and of the results of evaluations
-        of the policy that was learnt from it where those are named.
+        of the policy that was learnt from it where those are named. Of the phase after the last
+        committed one, all that has come and that no commit names yet.
 
         Args:
             phase: the phase.
@@ -177,6 +178,8 @@ class KeptRun:
             KeyError: the phase is not held; the message names those that are.
             BagError: the bag cannot be read.
         """
+        if phase == (-1 if self.newest is None else self.newest) + 1:
+            return _of(self._last.open(), kinds)
         results = type_name(EpisodeResult)
         evaluations = self._evaluations.get(phase, []) if results in kinds else []
         found: Iterable[tuple[type, bytes]] = ((EpisodeResult, data) for data in evaluations)
@@ -188,8 +191,7 @@ class KeptRun:
     def _read(self, phase: int, kinds: Collection[str]) -> Iterator[tuple[type, bytes]]:
         if self.folder is not None:
             return self._phases.read(phase, kinds)
-        held = self._last.get(phase)
-        return ((kind, data) for kind, data in held if not kinds or type_name(kind) in kinds)
+        return _of(self._last.get(phase), kinds)
 
     # ---- the end
 
@@ -207,6 +209,13 @@ class KeptRun:
             flush_seconds=self._flushes.seconds,
             flush_ms=self._flushes.times(),
         )
+
+
+def _of(
+    messages: Iterable[tuple[type, bytes]], kinds: Collection[str]
+) -> Iterator[tuple[type, bytes]]:
+    """Messages of these types; all where none is named."""
+    return ((kind, data) for kind, data in messages if not kinds or type_name(kind) in kinds)
 
 
 def _run_in(folder: Path) -> str | None:

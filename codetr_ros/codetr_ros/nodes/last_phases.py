@@ -35,6 +35,10 @@ class LastPhases:
         while len(self._committed) > self._phases:
             del self._committed[min(self._committed)]
 
+    def open(self) -> list[tuple[type, bytes]]:
+        """Kind and bytes of each record that no commit names yet, in order of arrival."""
+        return list(self._open.values())
+
     def get(self, phase: int) -> list[tuple[type, bytes]]:
         """Kind and bytes of each message of a committed phase.
 

@@ -133,8 +133,8 @@ class LiveScores:
             self._books = EpisodeScores(made, run_id, self._made, HELD)
 
     def resume(self, sequence: int) -> None:
-        """Go on with the number of the next score, where a node before this one gave some."""
-        self._sequence = sequence
+        """Go on with this number of the next score: a node before this one gave those below."""
+        self._sequence = max(self._sequence, sequence)
 
     def taken(self) -> list[CompositeReward]:
         """The scores that have become sure since the last call."""

@@ -4,7 +4,7 @@ The newest whole step is kept back until it is known whether the episode goes on
 episode of a robot (a stop, a silent sensor) is seen a step later, and the last step must carry it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -46,6 +46,24 @@ class StepLog:
     def left(self) -> int:
         """Steps that the phase still lacks."""
         return self._steps_of(self.phase) - self._taken - len(self._steps)
+
+    def restore(self, records: Iterable[Transitions]) -> None:
+        """Go on behind records that a node before this one has given out, in their order.
+
+        An episode that was under way is over: nobody saw how it went on.
+
+        Args:
+            records: of the last phase at the least.
+        """
+        for record in records:
+            if record.phase != self.phase:
+                self.phase, self._taken = record.phase, 0
+            self._taken += record.steps
+            self._sequence = record.sequence + 1
+            self.episode = record.episode
+            if record.phase_end:
+                self.phase, self._taken = record.phase + 1, 0
+        self.total = sum(map(self._steps_of, range(self.phase))) + self._taken
 
     def begin(self) -> None:
         """Begin an episode."""

@@ -165,7 +165,7 @@ class Recording(Wiring):
             return False
         if core.comes_early(record):  # something before it was lost
             self._early.append(record)
-            self._sweeper.ask(self._nodes(['sim']))
+            self._sweeper.ask(self._nodes(WRITERS[TOPICS[type(record)]]))
             return False
         learnt_from = type(record) in core.subscribes
         known = core.duplicated.total()

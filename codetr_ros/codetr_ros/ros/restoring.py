@@ -82,6 +82,8 @@ def go_on(member: Membership, joined: Joined) -> bool:
         NodeError: the recorder does not send what is needed.
         CheckpointError: a checkpoint is of another run.
     """
+    if member.role == 'sim' and joined.settings.on_robot:
+        return _robot_goes_on(member, joined)
     restore = _RESTORE.get(member.role)
     if restore is None or not _has_begun(member):
         return True
@@ -138,6 +140,29 @@ def _simulator(member: Membership, joined: Joined, newest: int, recorder: _Recor
     for record in chain.from_iterable(reversed(phases)):
         core.restore(record)
     core.resume(newest + 1)
+
+
+def _robot_goes_on(member: Membership, joined: Joined) -> bool:
+    """Let a robot go on behind all that the recorder has of it, also where no phase is committed;
+    false if asked to stop meanwhile.
+    """
+    core: Any = joined.core
+    recorder = _Recorder(member, joined.run.run_id)
+    kinds = (Transitions, CompositeReward, Commit)
+    records: list[Record] = []
+    try:
+        newest, _ = recorder.ask(NEWEST, Commit)
+        if newest is not None:
+            records += recorder.ask(newest, *kinds)[1]
+        under_way = 0 if newest is None else newest + 1
+        records += recorder.ask(under_way, *kinds)[1]
+    except _StoppedError:
+        return False
+    if records:
+        member.begin_counting_anew()
+        core.restore(records)
+        member.log.info(f'goes on where a node of this name ended: {core.begun()}')
+    return True
 
 
 def _evaluator(_: Membership, joined: Joined, newest: int, recorder: _Recorder) -> None:

@@ -1,0 +1,51 @@
+"""Nodes of a run on a robot are killed while it moves, and started again: the run goes on, and its
+bag teaches the same weights.
+"""
+
+import pytest
+
+from codetr_ros import cli
+from codetr_ros.bags.reader import Bag
+from codetr_ros.bags.verify import verify
+from codetr_ros.records import CompositeReward, Transitions
+from codetr_ros.runs import folder as run_folder
+from helpers import nodes
+from helpers.robot_runs import Person, RobotRun, robot_settings
+
+pytestmark = pytest.mark.slow
+ROLES = ('learner', 'reward', 'record', 'robot')
+
+
+@pytest.fixture(scope='module', autouse=True)
+def _domain():
+    with nodes.domain():
+        yield
+
+
+def test_a_run_ends_well_and_is_replayed_though_its_robot_node_and_its_recorder_were_killed(
+    tmp_path,
+):
+    settings = robot_settings(steps=240, scorers=('robot', 'inspection'))
+    folder = tmp_path / 'run'
+    with RobotRun(settings, folder) as run:
+        with Person(run) as person:
+            run.begin('--late', '0.5')
+            person.until(lambda: person.committed(0))
+            person.until(person.moves)
+            run.kill('robot')  # in the midst of a phase
+            person.until(lambda: 'goes on where a node of this name ended' in run.log('robot'))
+            person.until(lambda: person.committed(1))
+            run.kill('record')
+            person.until(lambda: 'goes on with' in run.log('record'))
+        codes = run.wait(*ROLES)
+        assert {codes[name] for name in ROLES} == {0}, run.log('robot')
+        assert run.report('robot')['counters']['times that the node was started again'] == 1
+    found = verify(folder / run_folder.BAG)
+    assert found.sound, found.findings.named
+    records = [entry.record for entry in Bag(folder / run_folder.BAG).entries()]
+    chunks = [record for record in records if isinstance(record, Transitions)]
+    assert sum(chunk.steps for chunk in chunks) == settings.steps
+    assert [chunk.sequence for chunk in chunks] == list(range(len(chunks)))
+    own = [r.sequence for r in records if isinstance(r, CompositeReward) and r.scorer == 'robot']
+    assert own == list(range(len(own))) and len(own) > 3
+    assert cli.main(['replay', str(folder), '--verify']) == 0
