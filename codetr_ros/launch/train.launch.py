@@ -37,6 +37,10 @@ ARGUMENTS = {
     'run_id': ('', 'id of the run; empty: made from the date'),
     'folder': ('', 'folder for bag, checkpoints and reports; empty: nothing is written'),
     'peer_deadline': ('60.0', 'seconds that nodes wait for each other'),
+    'leave_out_after': (
+        '30.0',
+        'seconds of silence after which a simulator of several is left out; 0: never',
+    ),
     'start_simulators': ('true', 'false: simulators are started by hand, on any machine'),
 }
 STOP_DEADLINE = '20'
@@ -81,7 +85,10 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     value = {name: LaunchConfiguration(name) for name in ARGUMENTS}
     settings, given = settings_of(context)
     shared = {name: value[name] for name in ('folder', 'run_id', 'peer_deadline')}
-    own = {'learner': {'config': value['config'], **as_parameters(given)}}
+    own = {
+        'learner': {'config': value['config'], **as_parameters(given)},
+        'record': {'leave_out_after': value['leave_out_after']},
+    }
     named = {role: role for role in settings.roles if role != 'sim'}
     if value['start_simulators'].perform(context).lower() == 'true':
         named |= dict.fromkeys(settings.simulator_names, 'sim')

@@ -20,8 +20,9 @@ def main(argv: list[str] | None = None) -> int:
     """Entry point; the imports follow the signal handlers, since they take seconds."""
     stop = Stop().install(starting=True)
     from codetr_ros.ros.node import run_node
+    from codetr_ros.ros.simulating import Simulating
 
-    return run_node('sim', 'sim', load, argv, stop)
+    return run_node('sim', 'sim', load, argv, stop, Simulating)
 
 
 if __name__ == '__main__':

@@ -25,7 +25,8 @@ def test_what_is_in_a_bag_is_counted(writer, tmp_path):
     assert run['scores']['min'] == min(values) and run['scores']['max'] == max(values)
     assert run['sources']['sim'] | {'task': ''} == {
         'task': '', 'observation_size': 3, 'action_size': 2, 'horizon': 1000,
-        'steps': 60, 'chunks': 12, 'episodes': 4, 'terminated': 0, 'truncated': 4,
+        'steps': 60, 'steps_dropped': 0, 'phases_dropped': 0, 'chunks': 12, 'episodes': 4,
+        'terminated': 0, 'truncated': 4,
     }  # fmt: skip
     assert found['topics']['/run/transitions']['messages'] == 12
     assert found['faults'] == 0

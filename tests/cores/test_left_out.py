@@ -1,15 +1,15 @@
 """A source from which nothing comes is left out of a phase, by everybody, and joins again."""
 
 import numpy as np
-import pytest
 
 from codetr_ros.cores.intake import Intake
 from codetr_ros.cores.learner import Learner
-from codetr_ros.cores.left_out import LeftOutError, is_left_out, undropped, voided
+from codetr_ros.cores.left_out import is_left_out, voided
 from codetr_ros.cores.recorder import Recorder
 from codetr_ros.cores.simulator import Simulator
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import Commit, Policy, TaskSpec, Transitions
+from codetr_ros.records.dropped import undropped
 from helpers.builders import commit, policy, run, score, task_spec, tiny, transitions
 from helpers.cores import slices
 
@@ -65,14 +65,19 @@ def test_a_source_joins_again_behind_the_voided_numbers():
     made.receive(permission(1, (5, 0)))  # the learner permits it nothing
     made.receive(whole(sequence=1, phase=1, first_step=5))
     (second,) = commits(work)
-    assert (second.sources, second.dropped) == (('sim',), ())
-    made.receive(permission(2))
+    assert (second.sources, second.dropped) == (('sim',), ('sim_2',))  # it is not there again
+    made.receive(task_spec(source='sim_2'))
+    made.receive(permission(2, (5, 0)))
     made.receive(whole(sequence=2, phase=2, first_step=10))
-    number = int(first.transitions[1]) + 1
-    made.receive(whole('sim_2', number, 2))
     (third,) = commits(work)
-    assert (third.sources, third.dropped) == (BOTH, ())
-    assert third.transitions.tolist() == [2, number]
+    assert (third.sources, third.dropped) == (('sim',), ())  # it is, and is permitted the next
+    made.receive(permission(3))
+    made.receive(whole(sequence=3, phase=3, first_step=15))
+    number = int(first.transitions[1]) + 1
+    made.receive(whole('sim_2', number, 3))
+    (fourth,) = commits(work)
+    assert (fourth.sources, fourth.dropped) == (BOTH, ())
+    assert fourth.transitions.tolist() == [3, number]
 
 
 def test_with_overlap_the_phase_that_was_permitted_meanwhile_waits_for_nobody_either():
@@ -128,15 +133,17 @@ def test_consumers_take_in_nothing_of_a_source_that_was_left_out_however_late_it
     assert intake.dropped == {'steps dropped': 3}
     intake.receive(transitions(source='sim_2', sequence=1, first_step=3, steps=2))
     assert intake.duplicated == {'transitions': 1}
-    made.receive(permission(1))
+    made.receive(task_spec(source='sim_2'))
     last = voided(SETTINGS, 1)
-    for record in (whole(sequence=1, phase=1, episode=1), whole('sim_2', last + 1, 1)):
-        made.receive(record)
-        intake.receive(record)
-    (second,) = commits(work)
-    intake.receive(second)
-    assert intake.take(1, memory)
-    assert memory.steps == 15
+    for phase, steps, more in ((1, (5, 0), []), (2, (5, 5), [whole('sim_2', last + 1, 2)])):
+        made.receive(permission(phase, steps))
+        for record in (whole(sequence=phase, phase=phase, episode=phase), *more):
+            made.receive(record)
+            intake.receive(record)
+        (one,) = commits(work)
+        intake.receive(one)
+        assert intake.take(phase, memory)
+    assert memory.steps == 20
 
 
 def permitted(core, work):
@@ -165,8 +172,10 @@ def test_the_learner_permits_a_source_nothing_until_it_has_announced_itself_agai
     made.receive(first)
     assert first.steps.tolist() == [5, 5]
     assert roll_out(whole()) == [5, 0]
-    core.receive(task_spec(source='sim_2'))
-    assert roll_out(whole(sequence=1, phase=1, episode=1)) == [5, 5]
+    core.receive(task_spec(source='sim_2'))  # the commit decides, not who is heard when
+    assert roll_out(whole(sequence=1, phase=1, episode=1)) == [5, 0]
+    made.receive(task_spec(source='sim_2'))
+    assert roll_out(whole(sequence=2, phase=2, episode=2)) == [5, 5]
 
 
 def simulator(name='sim_2'):
@@ -190,33 +199,32 @@ def test_a_simulator_that_was_left_out_announces_itself_and_goes_on_behind_what_
         dropped=('sim_2',),
     )
     dropped = transitions(source='sim_2', sequence=4, phase=1, first_step=5)
-    again, work = simulator()
+    before.receive(permission(1))
+    slices(work)  # it goes on, but nothing of that arrives in time
+    before.receive(permission(2, (5, 0)))
+    assert [type(record) for record in slices(work)] == [TaskSpec]
+    assert not before.displaced
+    before.receive(permission(3))
+    assert before.displaced
+    assert slices(work) == []
+    before.begin_anew()
     for record in undropped([*records, kept, dropped, out]):
-        again.restore(record)
-    again.resume(2)
-    assert [type(record) for record in slices(work)] == [TaskSpec]
-    again.receive(permission(2, (5, 0)))
-    assert [type(record) for record in slices(work)] == [TaskSpec]
-    again.receive(permission(3))
+        before.restore(record)
+    before.resume(3)
     chunk, *_ = [record for record in slices(work) if isinstance(record, Transitions)]
     assert (chunk.sequence, chunk.phase, chunk.episode, chunk.first_step) == (41, 3, 0, 3)
     np.testing.assert_array_equal(chunk.observations[0], records[1].observations[-1])
-    assert again.report().counters['phases left out'] == 1
-
-
-def test_a_simulator_that_went_on_while_it_was_left_out_must_start_again():
-    made, work = simulator()
-    made.receive(permission())
-    slices(work)
-    made.receive(permission(1, (5, 0)))
-    with pytest.raises(LeftOutError, match="'sim_2' was left out of the run before phase 1"):
-        next(work)
+    assert before.report().counters['phases left out'] == 1
 
 
 def test_a_simulator_that_begins_late_passes_over_what_is_committed():
     made, work = simulator()
     made.resume(0)
     made.receive(permission(2))
+    slices(work)
+    assert made.displaced  # what was recorded may have been voided meanwhile
+    made.begin_anew()
+    made.resume(2)
     found = [record for record in slices(work) if isinstance(record, Transitions)]
     assert [chunk.phase for chunk in found] == [2]
 

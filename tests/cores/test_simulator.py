@@ -312,7 +312,7 @@ def test_a_simulator_has_finished_after_a_policy_without_steps():
 
 
 def test_a_phase_in_which_only_others_have_steps_is_passed_over():
-    settings = tiny(task=NEVER_ENDS, simulators=2)
+    settings = tiny(task=NEVER_ENDS, simulators=2, steps=2, phase_steps=1, warmup_steps=1)
     shares = np.array([1, 0], np.uint32)
     first = policy(sources=('sim', 'sim_2'), steps=shares)
     second = permit(1, steps=10, sources=('sim', 'sim_2'))

@@ -13,7 +13,7 @@ from codetr_ros.records import (
     StepRewards,
     Transitions,
 )
-from codetr_ros.records.chain import named, publisher
+from codetr_ros.records.chain import named, publisher, void
 
 _MOST_HELD = 10_000  # the depth of another recorder's queue: a message that is later is lost
 _PERMITTING = (Transitions, CompositeReward, Preference, Commit)  # records that others wait for
@@ -51,9 +51,10 @@ def causal(messages: Iterable[MessageT], lag: int) -> Iterator[MessageT]:
             return record.phase - lag > committed
         if isinstance(record, (StepRewards, ScoreRequest)):
             return record.phase > committed
-        return isinstance(record, Commit) and any(
-            number >= numbers[key] for key, number in named(record).items()
-        )
+        if not isinstance(record, Commit):
+            return False
+        out = void(record)
+        return any(n >= numbers[key] for key, n in named(record).items() if key not in out)
 
     for message in messages:
         record = message.record

@@ -55,6 +55,12 @@ class Numbers:
         self.next = sequence + 1
         return True
 
+    def skip(self, last: int) -> None:
+        """Go on behind a number: those up to there are voided, and will not come."""
+        if self.whole == self.next:
+            self.whole = max(self.whole, last + 1)
+        self.next = max(self.next, last + 1)
+
     def finish(self, place: Any) -> None:
         """Report what never came."""
 
@@ -75,6 +81,11 @@ class SharedNumbers(Numbers):
             return False
         self.next = self.whole = self._numbering.next
         return True
+
+    def skip(self, last: int) -> None:
+        """Go on behind a number: those up to there are voided, and will not come."""
+        self._numbering.skip(last)
+        self.next = self.whole = self._numbering.next
 
     def finish(self, place: Any) -> None:
         """Report what never came."""
@@ -110,6 +121,8 @@ class SourceChecks:
         # phase -> sequence number of its last chunk, until committed
         self.ends: dict[int, int] = {}
         self.steps = 0
+        self.steps_dropped = 0
+        self.phases_dropped = 0
         self.scored = 0
         self._findings = findings
         self._lengths = array('I')  # steps of each episode so far
@@ -146,6 +159,13 @@ class SourceChecks:
         early, self._early = self._early, []
         for reward, where in early:
             self.score(reward, where)
+
+    def dropped(self, chunk: Transitions, place: Any) -> None:
+        """Check steps that were dropped, because their source was left out of the phase."""
+        if chunk.sequence >= self.numbers.next:  # else they came after the commit
+            self.numbers.take(chunk.sequence, place)
+        self.steps_dropped += chunk.steps
+        self._values(chunk, place)
 
     def _values(self, chunk: Transitions, place: Any) -> None:
         if self.spec is not None:

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from codetr_ros.bags.dropped import DroppedInBag
 from codetr_ros.bags.errors import Damage
-from codetr_ros.bags.reader import Bag, Entry
+from codetr_ros.bags.reader import Bag
 from codetr_ros.records import (
     Commit,
     CompositeReward,
@@ -67,6 +68,8 @@ class SourceCounts:
     action_size: int = 0
     horizon: int = 0
     steps: int = 0
+    steps_dropped: int = 0  # of `steps`: of phases that it was left out of
+    phases_dropped: int = 0  # in which it had steps to take
     chunks: int = 0
     episodes: int = 0  # begun
     terminated: int = 0
@@ -92,8 +95,8 @@ class RunCounts:
     labels: int = 0
     evaluations: dict[int, Range] = field(default_factory=dict)  # true return, by step
 
-    def take(self, record: Any) -> None:
-        """Count a record."""
+    def take(self, record: Any, dropped: bool = False) -> None:
+        """Count a record; `dropped` if its source was left out of the phase."""
         if isinstance(record, RunSpec):
             self._settings(record)
         elif isinstance(record, TaskSpec):
@@ -102,7 +105,7 @@ class RunCounts:
             source.observation_size = record.observation_size
             source.action_size = record.action_size
         elif isinstance(record, Transitions):
-            self._steps(record)
+            self._steps(record, dropped)
         elif isinstance(record, CompositeReward):
             self.scorers[record.scorer] = self.scorers.get(record.scorer, 0) + 1
             if math.isnan(record.value) and self._may_lack_scores:
@@ -115,6 +118,8 @@ class RunCounts:
             self.preferences += 1
         elif isinstance(record, Commit):
             self.phases.add(record.phase)
+            for name in set(record.dropped) & set(record.sources):
+                self.sources.setdefault(name, SourceCounts()).phases_dropped += 1
         elif isinstance(record, Policy):
             self.policy_versions.add(record.version)
         elif isinstance(record, StepRewards):
@@ -136,11 +141,12 @@ class RunCounts:
         if isinstance(settings, dict):
             self.settings = {name: _plain(settings[name]) for name in SETTINGS if name in settings}
 
-    def _steps(self, record: Transitions) -> None:
+    def _steps(self, record: Transitions, dropped: bool) -> None:
         source = self.sources.setdefault(record.source, SourceCounts())
         source.observation_size = record.observations.shape[1]
         source.action_size = record.actions.shape[1]
         source.steps += record.steps
+        source.steps_dropped += record.steps * dropped
         source.chunks += 1
         source.episodes += record.first_step == 0
         source.terminated += record.terminated
@@ -177,11 +183,6 @@ def _plain(value: Any) -> Any:
         return str(value)
 
 
-def namespace_of(entry: Entry) -> str:
-    """The namespace of an entry's topic."""
-    return entry.topic.rpartition('/')[0] or '/'
-
-
 def survey(path: Path | str) -> dict[str, Any]:
     """What is in a bag, as JSON. Faults are counted and do not end the survey.
 
@@ -195,6 +196,7 @@ def survey(path: Path | str) -> dict[str, Any]:
         faults += 1
 
     bag = Bag(path, damaged)
+    dropped = DroppedInBag(bag)
     runs: dict[tuple[str, str], RunCounts] = {}
     first = last = None
     for raw in bag.raw():
@@ -202,8 +204,9 @@ def survey(path: Path | str) -> dict[str, Any]:
         last = raw.log_time if last is None else max(last, raw.log_time)
         entry = bag.entry(raw)
         if entry is not None:
-            key = namespace_of(entry), entry.record.run_id
-            runs.setdefault(key, RunCounts(*key)).take(entry.record)
+            key = entry.namespace, entry.record.run_id
+            run = runs.setdefault(key, RunCounts(*key))
+            run.take(entry.record, dropped.holds(entry))
     return {
         'bag': str(bag.path),
         'files': [{'name': file.name, 'bytes': file.stat().st_size} for file in bag.files],

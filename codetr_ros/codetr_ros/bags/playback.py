@@ -34,7 +34,7 @@ from codetr_ros.records import (
     Transitions,
     TrueRewards,
 )
-from codetr_ros.records.chain import named, publisher
+from codetr_ros.records.chain import named, publisher, void
 from codetr_ros.records.digests import digest
 from codetr_ros.records.numbering import Judgement, Numbering
 from codetr_ros.runs.reports import CoreReport
@@ -344,8 +344,13 @@ class Playback:
 
     def _check(self, commit: Commit) -> None:
         """Refuse a commit that names something not played."""
+        out = void(commit)
         for key, number in named(commit).items():
-            if number >= self._due[key]:
+            if key in out:
+                self.counters['phases of a source dropped'] += key[0] is Transitions
+                self._numbers[key[1]].skip(number)
+                self._due[key] = max(self._due[key], number + 1)
+            elif number >= self._due[key]:
                 self._lacks(key, number)
 
     def _lacks(self, key: tuple[type, str], last: int) -> None:

@@ -43,6 +43,11 @@ class Entry(NamedTuple):
     publish_time: int  # [ns] when it was published; the log time where the bag has none
     place: Place
 
+    @property
+    def namespace(self) -> str:
+        """That of its topic."""
+        return self.topic.rpartition('/')[0] or '/'
+
 
 class Message(NamedTuple):
     """A message of any type in a bag."""

@@ -30,7 +30,7 @@ from codetr_ros.records import (
     TrueRewards,
     describe,
 )
-from codetr_ros.records.chain import Chain, states_digests
+from codetr_ros.records.chain import Chain, named, states_digests, void
 from codetr_ros.records.checks import check_preference
 from codetr_ros.records.numbering import Judgement
 from codetr_ros.system.parsing import parse_json
@@ -80,10 +80,17 @@ class RunChecks:
             EpisodeResult: self._result,
         }
 
-    def take(self, entry: Entry) -> None:
-        """Check the next record."""
+    def take(self, entry: Entry, dropped: bool = False) -> None:
+        """Check the next record.
+
+        Args:
+            entry: of the bag.
+            dropped: whether its source was left out of the phase.
+        """
         check = self._take.get(entry.kind)
-        if check is not None:
+        if dropped:
+            self._dropped(entry.record, entry.place)
+        elif check is not None:
             check(entry.record, entry.place)
         self._chain.note(entry.record)
         while self._waiting and (self._ordered or self._arrived(self._waiting[0][0])):
@@ -92,22 +99,45 @@ class RunChecks:
     def _arrived(self, commit: Commit) -> bool:
         """Whether the newest of everything that a commit names is there."""
         numbers = {name: source.numbers for name, source in self.sources.items()}
-        named = (
-            (commit.sources, commit.transitions, numbers),
-            (commit.scorers, commit.scores, self._scorers),
-        )
+        out = void(commit)
         return all(
-            last < 0 or (name in there and last < there[name].next)
-            for names, newest, there in named
-            for name, last in zip(names, newest.tolist(), strict=True)
+            key in out or last < 0 or (name in there and last < there[name].next)
+            for key, last in named(commit).items()
+            for name in (key[1],)
+            for there in (numbers if key[0] is Transitions else self._scorers,)
         )
 
+    def _dropped(self, record: Any, place: Any) -> None:
+        """Check a record of a source that was left out."""
+        if isinstance(record, Transitions):
+            self._source(record).dropped(record, place)
+        elif isinstance(record, CompositeReward):
+            numbers = self._numbered(record)
+            if record.sequence >= numbers.next:  # else it came after the commit
+                numbers.take(record.sequence, place)
+
+    def _void(self, commit: Commit) -> None:
+        """Go on behind the numbers that a commit voids."""
+        out = void(commit)
+        for (kind, name), last in named(commit).items():
+            if (kind, name) not in out:
+                continue
+            if kind is Transitions:
+                source = self._source_of(name)
+                source.ends.pop(commit.phase, None)
+                source.phases_dropped += 1
+                source.numbers.skip(last)
+                source.commit(last)
+            else:
+                self._numbers_of(name).skip(last)
+
     def _source(self, record: Any) -> SourceChecks:
-        if record.source not in self.sources:
-            self.sources[record.source] = SourceChecks(
-                record.source, self._cuts, self._findings, self._elsewhere
-            )
-        return self.sources[record.source]
+        return self._source_of(record.source)
+
+    def _source_of(self, name: str) -> SourceChecks:
+        if name not in self.sources:
+            self.sources[name] = SourceChecks(name, self._cuts, self._findings, self._elsewhere)
+        return self.sources[name]
 
     def _add(self, kind: str, place: Any, text: str) -> None:
         self._findings.add(kind, place, f'{self.name}: {text}')
@@ -158,12 +188,13 @@ class RunChecks:
 
     def _numbered(self, record: Judgement) -> Numbers:
         """The numbers of a scorer, whose scores and preferences have one sequence."""
-        if record.scorer not in self._scorers:
+        return self._numbers_of(record.scorer)
+
+    def _numbers_of(self, scorer: str) -> Numbers:
+        if scorer not in self._scorers:
             kind = SharedNumbers if self._elsewhere else Numbers
-            self._scorers[record.scorer] = kind(
-                f'composite rewards of {record.scorer!r}', self._findings
-            )
-        return self._scorers[record.scorer]
+            self._scorers[scorer] = kind(f'composite rewards of {scorer!r}', self._findings)
+        return self._scorers[scorer]
 
     def _preference(self, record: Preference, place: Any) -> None:
         if not self._numbered(record).take(record.sequence, place):
@@ -202,7 +233,10 @@ class RunChecks:
             )
         whole = record.phase == self.phases == self.whole
         self.phases = max(self.phases, record.phase + 1)
+        self._void(record)
         for name, last in zip(record.sources, record.transitions.tolist(), strict=True):
+            if name in record.dropped:
+                continue
             source = self.sources.get(name)
             there = source.numbers if source else None
             whole &= self._named('transitions', name, last, there, record.phase, place)
@@ -217,6 +251,8 @@ class RunChecks:
                 )  # fmt: skip
             source.commit(last)
         for name, last in zip(record.scorers, record.scores.tolist(), strict=True):
+            if name in record.dropped:
+                continue
             there = self._scorers.get(name)
             whole &= self._named('composite rewards', name, last, there, record.phase, place)
         self.whole += whole
@@ -308,6 +344,11 @@ class RunChecks:
             numbers.finish(place)
         for source in self.sources.values():
             source.finish(self.phases > 0, place)
+            if source.phases_dropped:
+                self._findings.remarks.append(
+                    f'{self.name}: {source.name!r} was left out of {source.phases_dropped} phases '
+                    f'in which it had steps to take; {source.steps_dropped} that came were dropped'
+                )
             if self.phases and source.tail:
                 self._findings.remarks.append(
                     f'{self.name}: the last {source.tail} transitions of {source.name!r} are of a '

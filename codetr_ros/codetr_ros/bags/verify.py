@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from codetr_ros.bags import metadata
+from codetr_ros.bags.dropped import DroppedInBag
 from codetr_ros.bags.episodes import missing_numbers
 from codetr_ros.bags.errors import BagError, Damage
 from codetr_ros.bags.findings import Findings
-from codetr_ros.bags.info import namespace_of
 from codetr_ros.bags.raw import RawMessage
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.run_checks import RunChecks
@@ -49,6 +49,11 @@ class Verdict:
                     'run_id': run_id,
                     'phases_committed': run.phases,
                     'phases_whole': run.whole,
+                    'steps_dropped': {
+                        name: source.steps_dropped
+                        for name, source in sorted(run.sources.items())
+                        if source.phases_dropped
+                    },
                 }
                 for (namespace, run_id), run in sorted(self.runs.items())
             ],
@@ -89,6 +94,7 @@ def verify(path: Path | str) -> Verdict:
         findings.add('index' if damage.harmless else 'file', damage.place, damage.text + lost)
 
     bag = Bag(path, damaged, thorough=True)
+    dropped = DroppedInBag(bag)
     runs: dict[tuple[str, str], RunChecks] = {}
     first: dict[str, str] = {}
     numbering = _Numbering(findings)
@@ -106,13 +112,13 @@ def verify(path: Path | str) -> Verdict:
             continue
         if entry is None:
             continue
-        namespace, run_id = key = namespace_of(entry), entry.record.run_id
+        namespace, run_id = key = entry.namespace, entry.record.run_id
         if key not in runs:
             runs[key] = RunChecks(namespace, run_id, findings, raw.channel.numbered)
             if first.setdefault(namespace, run_id) != run_id:
                 text = f'two runs are mixed in {namespace}: {first[namespace]!r} and {run_id!r}'
                 findings.add('run', entry.place, text)
-        runs[key].take(entry)
+        runs[key].take(entry, dropped.holds(entry))
     for run in runs.values():
         run.finish(bag.path)
     if bag.path.is_dir():

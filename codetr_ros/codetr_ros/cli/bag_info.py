@@ -89,6 +89,15 @@ def _bag(contents: Mapping[str, Any]) -> Table:
     return table
 
 
+def _left_out(source: Mapping[str, Any]) -> str:
+    if not source['phases_dropped']:
+        return ''
+    return (
+        f'; left out of {source["phases_dropped"]} phases, {source["steps_dropped"]} of its steps '
+        'were dropped'
+    )
+
+
 def _run(run: Mapping[str, Any]) -> Table:
     table = _pairs()
     table.add_row('run', f'{run["run_id"]} in {run["namespace"]}')
@@ -100,7 +109,7 @@ def _run(run: Mapping[str, Any]) -> Table:
             f'{source["task"] or "no task announced"}: {source["observation_size"]} observations, '
             f'{source["action_size"]} actions, {source["steps"]} steps in {source["chunks"]} '
             f'chunks, {source["episodes"]} episodes ({source["terminated"]} terminated, '
-            f'{source["truncated"]} truncated)',
+            f'{source["truncated"]} truncated)' + _left_out(source),
         )
     scored = f'{run["segments_scored"]}, {run["steps_scored"]} steps'
     unscored = run['segments_unscored']

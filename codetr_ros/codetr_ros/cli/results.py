@@ -45,6 +45,7 @@ def complete(
         log: prints a line for people.
         stopped: whether the user does not want to wait for the end.
     """
+    from codetr_ros.bags.dropped import undropped_entries
     from codetr_ros.bags.errors import BagError, Damage
     from codetr_ros.bags.reader import Bag
 
@@ -54,7 +55,7 @@ def complete(
         # labels last: they may have been recorded before the true rewards of their phase
         unlabelled = (EpisodeResult, Metrics, Commit, TrueRewards, CompositeReward)
         for kinds in unlabelled, (StepRewards,):
-            for entry in bag.entries(kinds):
+            for entry in undropped_entries(bag, kinds):
                 if stopped():
                     log('stopped: the summary holds what was read until now')
                     return

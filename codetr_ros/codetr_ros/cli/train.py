@@ -21,6 +21,7 @@ from codetr_ros.cli.terminal import console
 from codetr_ros.cli.train_flags import FLAGS, PEER_DEADLINE, wrong
 from codetr_ros.config import Settings, SettingsError
 from codetr_ros.nodes import signing
+from codetr_ros.nodes.silence import LEAVE_OUT_AFTER
 from codetr_ros.processes import launcher
 from codetr_ros.processes.launcher import LaunchError
 from codetr_ros.processes.openmp import crowded, threading_environment
@@ -62,6 +63,8 @@ class Topics:
     Attributes:
         namespace: that of the nodes; None: one of the run's own.
         peer_deadline: seconds that they wait for each other; 0: for ever.
+        leave_out_after: seconds of silence after which a simulator of several is left out; 0:
+            never.
         start: starts each.
         robot: parameters of the robot node, where the task is that of a robot.
         restarts: how often one that was killed is started again.
@@ -70,6 +73,7 @@ class Topics:
 
     namespace: str | None = None
     peer_deadline: float = PEER_DEADLINE
+    leave_out_after: float = LEAVE_OUT_AFTER
     start: launcher.Start = launcher.start_program
     robot: Mapping[str, str | bool] | None = None
     restarts: Restarts = dataclasses.field(default_factory=Restarts)
@@ -166,7 +170,9 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
 
 def _topics(extra: Mapping[str, Any], namespace: str | None, start: launcher.Start) -> Topics:
     restarts = Restarts(extra['restarts'], extra['restarts_within'])
-    return Topics(namespace, extra['peer_deadline'], start, restarts=restarts)
+    return Topics(
+        namespace, extra['peer_deadline'], extra['leave_out_after'], start, restarts=restarts
+    )
 
 
 def default_out(settings: Settings, stamp: str) -> str:
@@ -312,6 +318,7 @@ def _over_topics(
         folder,
         namespace=namespace,
         peer_deadline=topics.peer_deadline,
+        leave_out_after=topics.leave_out_after,
         robot=topics.robot,
     )
     watch = _watcher(settings)

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import tyro
 
 from codetr_ros.cli import film
+from codetr_ros.nodes.silence import LEAVE_OUT_AFTER
 from codetr_ros.processes import middleware, restarts
 
 PEER_DEADLINE = 60.0
@@ -42,6 +43,18 @@ FLAGS: Sequence[tuple[str, Any, Any]] = [
             ),
         ],
         PEER_DEADLINE,
+    ),
+    (
+        'leave_out_after',
+        Annotated[
+            float,
+            tyro.conf.arg(
+                metavar='S',
+                help='seconds of silence after which a simulator of several is left out, and the '
+                'run goes on without it until it is there again; 0: never',
+            ),
+        ],
+        LEAVE_OUT_AFTER,
     ),
     (
         'restarts',
@@ -122,6 +135,8 @@ def wrong(extra: Mapping[str, Any]) -> str | None:
         return '--namespace is for nodes, and --in-process starts none: leave out one of them'
     if namespace is not None and (reason := middleware.wrong_namespace(namespace)):
         return reason
-    return middleware.wrong_seconds('--peer-deadline', extra['peer_deadline']) or restarts.wrong(
-        extra['restarts'], extra['restarts_within']
+    return (
+        middleware.wrong_seconds('--peer-deadline', extra['peer_deadline'])
+        or middleware.wrong_seconds('--leave-out-after', extra['leave_out_after'], 'never')
+        or restarts.wrong(extra['restarts'], extra['restarts_within'])
     )

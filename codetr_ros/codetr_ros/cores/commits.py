@@ -27,7 +27,7 @@ class Commits:
     Args:
         settings: of the run.
         tasks: its sources.
-        absent: those that were left out of phases, and may be permitted nothing.
+        absent: those of them that are permitted nothing, by the commits that were taken.
         permitted: returns the newest phase that can have been permitted.
         refused: counts refusals that come later than `receive`, by topic.
     """
@@ -135,20 +135,21 @@ class Commits:
             return 'states no digests: install the same version of codetr_ros everywhere'
         if not commit.sources:
             return 'names no sources, and every phase has steps: stop what publishes it'
-        if not self._tasks.known:
+        absent = self._absent.of(commit.phase)
+        if not self._tasks.known or absent is None:
             return ''  # asked again before it is taken
         shares = self._settings.shares_of(commit.phase)
         due = {name for name, n in zip(self._tasks.sources, shares, strict=True) if n}
         named, dropped = set(commit.sources), set(commit.dropped)
-        absent = {name for name in due if self._absent.may_lack(name)}
         if (
-            not due - absent <= named <= due
-            or not dropped < named
+            named != due - absent
+            or not named - dropped
+            or not dropped <= named | absent
             or len(named) != len(commit.sources)
         ):
             return (
                 f'names sources={list(commit.sources)} and dropped={list(commit.dropped)}, '
-                f'permitted were {sorted(due)}: stop what publishes it'
+                f'permitted were {sorted(due - absent)}: stop what publishes it'
             )
         return ''
 

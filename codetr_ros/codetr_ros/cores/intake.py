@@ -75,7 +75,7 @@ class Intake:
         self._early: list[tuple[int, Judgement]] = []
         self.duplicated: Counter[str] = Counter()
         self.refused = self.tasks.refused
-        self.absent = Absent()
+        self.absent = Absent(settings)
         self.dropped: Counter[str] = Counter()  # of sources that were left out of a phase
         newest = permitted or (lambda: settings.phases - 1)
         self.commits = Commits(settings, self.tasks, self.absent, newest, self.refused)
@@ -116,7 +116,6 @@ class Intake:
         check_run(record, self._run)
         if isinstance(record, TaskSpec):
             self.tasks.announce(record, self.receive)
-            self.absent.announced(record.source)
         elif isinstance(record, Transitions):
             if self.tasks.admit(record):
                 self._hold_steps(record)

@@ -176,10 +176,9 @@ class Learner(Consumer):
         assert learner is not None
         sources = self._intake.tasks.sources
         shares = self._settings.shares_of(phase)
-        steps = [
-            0 if source in self._intake.absent else n
-            for source, n in zip(sources, shares, strict=True)
-        ]
+        absent = self._intake.absent.of(phase)
+        assert absent is not None  # the phase that it follows from is taken in
+        steps = [0 if source in absent else n for source, n in zip(sources, shares, strict=True)]
         random = phase < settings.warmup_phases
         policy = Policy(
             run_id=self._run.run_id,

@@ -1,19 +1,20 @@
 """Sources that are left out of phases, because nothing comes from them.
 
-A commit names them in `dropped`. It then also voids numbers: those that it names as the last of
-such a source are beyond all that the source can have published by then. So whatever it published
-and nobody has seen yet is known by its number, wherever and whenever it arrives, and is dropped.
-The source begins again behind them, with the episode as it was after its last committed phase.
+A commit names them in `dropped`. For those that were permitted steps it also voids numbers: those
+that it names as the last of such a source are beyond all that the source can have published by
+then. So whatever it published and nobody has seen yet is known by its number, wherever and
+whenever it arrives, and is dropped. The source begins again behind them, with the episode as it
+was after its last phase that was not dropped.
+
+A commit also names those that were left out before and have not announced themselves again. Who is
+permitted steps follows from that alone (`Absent`), so that it is the same for everybody who reads
+the commits, also later and from a bag.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 
 from codetr_ros.config import Settings
-from codetr_ros.records import Commit, Policy, Record
-
-
-class LeftOutError(RuntimeError):
-    """A simulator that was left out of phases while it went on: it must start again."""
+from codetr_ros.records import Commit, Policy
 
 
 def voided(settings: Settings, due: int) -> int:
@@ -32,20 +33,6 @@ def is_left_out(settings: Settings, policy: Policy, sources: Iterable[str]) -> b
     given = dict(zip(policy.sources, policy.steps.tolist(), strict=True))
     have_shares = settings.steps_of(policy.phase) >= settings.source_count
     return have_shares and not any(given[each] for each in sources)
-
-
-def undropped(records: Iterable[Record]) -> Iterator[Record]:
-    """The records of committed phases, with their commits, in the order of a bag; without those of
-    sources in phases that they were left out of.
-    """
-    held: list[Record] = []
-    for record in records:
-        held.append(record)
-        if isinstance(record, Commit):
-            yield from (
-                each for each in held if getattr(each, 'source', None) not in record.dropped
-            )
-            held = []
 
 
 class LeftOut:
@@ -74,27 +61,25 @@ class LeftOut:
 
 
 class Absent:
-    """The sources that the learner permits nothing, until they have announced themselves again."""
+    """The sources that are permitted nothing in a phase, by the commits.
 
-    def __init__(self) -> None:
-        self._sources: set[str] = set()
-        self._unnamed: set[str] = set()  # since a commit that dropped them
+    Those that the commit of the phase names with which the permission was learnt: `lag` phases
+    before. In the first phases, which are permitted before there is a commit, nobody.
+
+    Args:
+        settings: of the run.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._dropped: dict[int, frozenset[str]] = {}
 
     def follow(self, commit: Commit) -> None:
-        """Take note of who was left out of a phase, and of who was part of it."""
-        self._sources -= set(commit.sources)
-        self._sources |= set(commit.dropped)
-        self._unnamed = self._unnamed - set(commit.sources) | set(commit.dropped)
+        """Take note of who was left out of a phase, in the order of phases."""
+        self._dropped[commit.phase] = frozenset(commit.dropped)
+        self._dropped.pop(commit.phase - self._settings.lag, None)
 
-    def announced(self, source: str) -> None:
-        """Take note that a source is there."""
-        self._sources.discard(source)
-
-    def may_lack(self, source: str) -> bool:
-        """Whether the next commit need not name a source: it may have announced itself again only
-        after the phase was permitted.
-        """
-        return source in self._unnamed
-
-    def __contains__(self, source: object) -> bool:
-        return source in self._sources
+    def of(self, phase: int) -> frozenset[str] | None:
+        """Who is permitted nothing in a phase; None if that cannot be known yet."""
+        decided = phase - self._settings.lag
+        return frozenset() if decided < 0 else self._dropped.get(decided)

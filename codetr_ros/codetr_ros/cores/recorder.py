@@ -87,6 +87,7 @@ class Recorder(Part):
         self._numbers: defaultdict[str, Numbering] = defaultdict(Numbering)
         self._committed_scores: Counter[str] = Counter()
         self._left_out = LeftOut(settings)
+        self._absent: set[str] = set()  # left out, and not there again
         self._counters: Counter[str] = Counter()
         self.refused = self._tasks.refused
         self.phase = 0  # the next to be committed
@@ -101,6 +102,7 @@ class Recorder(Part):
         check_run(record, self._run)
         if isinstance(record, TaskSpec):
             self._tasks.announce(record, self.receive)
+            self._absent.discard(record.source)
         elif isinstance(record, Policy):
             if self._settings.free:
                 return  # nothing waits for a permission
@@ -176,6 +178,11 @@ class Recorder(Part):
                 'learner'
             )
 
+    @property
+    def absent(self) -> frozenset[str]:
+        """The sources that were left out and have not announced themselves again."""
+        return frozenset(self._absent)
+
     def leave_out(self, sources: Collection[str]) -> list[str]:
         """Leave sources out of the phase that is waited for: nothing comes from them. If nothing
         came from any source, nobody is left out, because a phase without steps teaches nothing.
@@ -233,7 +240,8 @@ class Recorder(Part):
             if isinstance(record, self.subscribes):
                 self.receive(record)
             return
-        self._left_out.leave_out(record.dropped, record.phase)
+        self._left_out.leave_out(set(record.dropped) & set(record.sources), record.phase)
+        self._absent = set(record.dropped) - set(record.sources)
         if record.phase != self.phase or not self._rolled_out(record.phase):
             raise RecordError(
                 f'{describe(record)} is in the bag, where phase {self.phase} is the next to be '
@@ -241,7 +249,7 @@ class Recorder(Part):
                 '`codetr bag verify` lists what is missing'
             )
         made = self._commit(record.phase, record)
-        for field in ('sources', 'transitions', 'scorers', 'scores', *STATED):
+        for field in ('sources', 'dropped', 'transitions', 'scorers', 'scores', *STATED):
             is_, was = (np.array(getattr(one, field)).tolist() for one in (made, record))
             if is_ != was and (was or field not in STATED):
                 raise RecordError(
@@ -353,11 +361,11 @@ class Recorder(Part):
         self._permitted.pop(phase, None)
         last = []
         scorers = set(self._scores)
-        dropped = []
+        dropped = self._absent - set(members)
         for source in members:
             scorers.add(source)
             if not self._there(phase, source, steps[source]):
-                dropped.append(source)
+                dropped.add(source)
                 self._drop(phase, source)
                 last.append(self._transitions[source] - 1)
                 continue
@@ -379,9 +387,10 @@ class Recorder(Part):
                 transitions=np.array(last, np.int64),
                 scorers=names,
                 scores=scores,
-                dropped=tuple(dropped),
+                dropped=tuple(sorted(dropped)),
             )
         )
+        self._absent = dropped
         self._chain.follow(recorded or commit)
         self._labels.follow(phase)
 

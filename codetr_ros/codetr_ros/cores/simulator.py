@@ -1,13 +1,14 @@
 """A simulator: rolls out the steps that each policy permits, and publishes what happened."""
 
 import hashlib
+import logging
 import time
 from collections import Counter
 from collections.abc import Iterator
 
 from codetr_ros.config import Settings
 from codetr_ros.cores.core import Part
-from codetr_ros.cores.left_out import LeftOutError, is_left_out
+from codetr_ros.cores.left_out import is_left_out
 from codetr_ros.policy.acting import ActingPolicy
 from codetr_ros.records import (
     TOPICS,
@@ -26,6 +27,8 @@ from codetr_ros.runs.reports import CoreReport
 from codetr_ros.simulation.permission import acting_policy, check_policy
 from codetr_ros.simulation.scorer import ScoreScale
 from codetr_ros.simulation.source import Source
+
+_log = logging.getLogger(__name__)
 
 
 class Simulator(Part):
@@ -57,17 +60,46 @@ class Simulator(Part):
         self._settings = settings
         self._name = name
         self._scale = ScoreScale.of(settings)
-        self._sources = [
-            Source(run, settings, each, self._scale) for each in settings.sources_of(name)
-        ]
+        self._sources = self._made()
         self._waiting: dict[int, tuple[Policy, ActingPolicy | None]] = {}
         self._phase = 0  # the next to be run
         self._resumed = False
         self._ran = False  # whether it has taken steps since it began or went on
+        self._left_out = False  # of the phase before, or of some before that
         self._first = 0  # that is run in this process: those before it were run in another
         self._known: dict[int, tuple[int, bytes, bytes]] = {}  # what was permitted, by phase
         self._counters: Counter[str] = Counter()
         self._closed = False
+
+    def _made(self) -> list[Source]:
+        return [
+            Source(self._run, self._settings, each, self._scale)
+            for each in self._settings.sources_of(self._name)
+        ]
+
+    @property
+    def displaced(self) -> bool:
+        """Whether it is permitted to go on after it was left out: its place in the run is then
+        what was recorded of it. It waits for `begin_anew`, `restore` and `resume`.
+        """
+        policy, _ = self._waiting.get(self._phase, (None, None))
+        return self._left_out and policy is not None and self._permits(policy)
+
+    def _permits(self, policy: Policy) -> bool:
+        return bool(policy.steps.any()) and not is_left_out(
+            self._settings, policy, (each.name for each in self._sources)
+        )
+
+    def begin_anew(self) -> None:
+        """Forget the episodes that are under way: some of their steps were dropped.
+
+        Raises:
+            TaskError: an environment is at fault.
+        """
+        for source in self._sources:
+            source.close()
+        self._sources = self._made()
+        self._left_out = self._ran = False
 
     def restore(self, record: Record) -> None:
         """Take one of the records that it has published before, in order: transitions, true
@@ -75,7 +107,8 @@ class Simulator(Part):
         Those of other sources, and other kinds, are passed over.
         """
         for source in self._sources:
-            if isinstance(record, Commit) and source.name in record.dropped:
+            dropped = isinstance(record, Commit) and set(record.dropped) & set(record.sources)
+            if isinstance(record, Commit) and dropped and source.name in dropped:
                 last = dict(zip(record.sources, record.transitions.tolist(), strict=True))
                 scores = dict(zip(record.scorers, record.scores.tolist(), strict=True))
                 source.skip(last[source.name], scores.get(source.name))
@@ -135,6 +168,11 @@ class Simulator(Part):
         self._known[policy.phase] = _content(policy)
 
     @property
+    def lacks_permission(self) -> bool:
+        """Whether it waits for the policy of the next phase to be run."""
+        return not self.finished and self._phase not in self._waiting
+
+    @property
     def due(self) -> int:
         """The next phase to be run."""
         return self._phase
@@ -145,17 +183,16 @@ class Simulator(Part):
         """
         yield [source.spec() for source in self._sources]
         while not self.finished:
-            self._pass_over()
-            policy, acting = self._waiting.pop(self._phase, (None, None))
-            if policy is None:
+            self._pass_over_lost()
+            if self._phase not in self._waiting or self.displaced:
                 yield None
                 continue
+            policy, acting = self._waiting.pop(self._phase)
             self._phase += 1
             if not policy.steps.any():
                 self.finished = True
-            elif is_left_out(self._settings, policy, (each.name for each in self._sources)):
-                self._check_clean(policy.phase)
-                self._counters['phases left out'] += 1
+            elif not self._permits(policy):
+                self._note_left_out(1)
                 yield [source.spec() for source in self._sources]  # it is there: let it in
             else:
                 self._ran = True
@@ -163,7 +200,7 @@ class Simulator(Part):
         while True:
             yield None
 
-    def _pass_over(self) -> None:
+    def _pass_over_lost(self) -> None:
         """Pass over phases whose policy never came to a simulator that has joined late, and that
         are committed: a newer policy was published after them.
         """
@@ -171,23 +208,23 @@ class Simulator(Part):
         joined_late = self._resumed and not self._ran
         if not joined_late or self._phase in self._waiting or committed < self._phase:
             return
-        self._counters['phases left out'] += committed + 1 - self._phase
-        self._phase = committed + 1
-        for phase in [phase for phase in self._waiting if phase <= committed]:
-            del self._waiting[phase]
+        self.pass_over(committed + 1)
 
-    def _check_clean(self, phase: int) -> None:
-        """Refuse to go on with episodes whose last steps were dropped.
+    def pass_over(self, phase: int) -> None:
+        """Go on with a phase: those before it are committed without this simulator."""
+        self._note_left_out(phase - self._phase)
+        self._phase = phase
+        for before in [before for before in self._waiting if before < phase]:
+            del self._waiting[before]
 
-        Raises:
-            LeftOutError: it has taken steps since it began or went on.
-        """
-        if self._ran:
-            raise LeftOutError(
-                f'{self._name!r} was left out of the run before phase {phase}, because nothing '
-                'came from it for too long: its steps since then are dropped. Start it again: it '
-                'joins again with the next phase'
-            )
+    def _note_left_out(self, phases: int) -> None:
+        if not self._left_out:
+            _log.warning(
+                '%s is left out of the run: it begins again where what was recorded of it ends, '
+                'as soon as it is permitted to', self._name,
+            )  # fmt: skip
+        self._left_out = True
+        self._counters['phases left out'] += phases
 
     def _run_phase(self, policy: Policy, acting: ActingPolicy | None) -> Iterator[list[Record]]:
         going = [

@@ -105,12 +105,15 @@ class Peers:
         writers = {role for topic in topics for role in roles.WRITERS.get(topic, ())}
         return [peer for role in sorted(writers) for peer in self.alive(role)]
 
-    def failed(self) -> list[str]:
+    def failed(self, among: Iterable[Peer] | None = None) -> list[str]:
         """Roles and names of the nodes that have died or else, since a node that dies makes others
         give up, of those that have given up, in words.
+
+        Args:
+            among: the nodes that count; None: all.
         """
         died, given_up = [], []
-        for peer in self.newest():
+        for peer in self.newest() if among is None else among:
             if peer.failed:
                 who = f'{peer.presence.role} {peer.presence.node} has'
                 if peer.presence.finished:

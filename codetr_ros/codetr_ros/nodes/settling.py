@@ -1,11 +1,11 @@
 """Whether a recorder that has committed every phase may end."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from codetr_ros.nodes.errors import NodeError
 from codetr_ros.nodes.patience import GRACE, Limit
-from codetr_ros.nodes.peers import Peers
+from codetr_ros.nodes.peers import Peer, Peers
 
 
 def still_missing(
@@ -35,12 +35,20 @@ class Settling:
         who: the recorder's full name.
         peers: the other nodes.
         limit: how long it waits for silent ones.
+        gone: whether nobody waits for a node any more, at a monotonic time [s]: it was left out.
     """
 
-    def __init__(self, who: str, peers: Peers, limit: Limit) -> None:
+    def __init__(
+        self,
+        who: str,
+        peers: Peers,
+        limit: Limit,
+        gone: Callable[[Peer, float], bool] = lambda peer, now: False,
+    ) -> None:
         self._who = who
         self._peers = peers
         self._deadline = limit.seconds
+        self._gone = gone
 
     def check(self, missing: Mapping[str, int], seconds: float, now: float) -> tuple[bool, str]:
         """Whether all nodes have finished and nothing is missing; and what the recorder does.
@@ -54,14 +62,15 @@ class Settling:
             NodeError: a node has ended too early, or records never arrived.
         """
         grace = max(GRACE, self._deadline)  # one that was killed may be started again meanwhile
+        awaited = [p for p in self._peers.newest() if not self._gone(p, now)]
         there = [
             p
-            for p in self._peers.newest()
+            for p in awaited
             if not p.presence.finished and not (p.failed and now - p.received_at > grace)
         ]
         running = [f'{p.presence.role} {p.presence.node}' for p in there]
         if not running and not missing:
-            if failed := self._peers.failed():
+            if failed := self._peers.failed(awaited):
                 raise NodeError(
                     f'{self._who}: every phase is recorded, but {"; ".join(failed)}, and the bag '
                     'lacks what was still to come from there. Look at the log of that node'

@@ -1,23 +1,54 @@
 """Which sources are silent, so that a phase need not wait for them."""
 
 from codetr_ros.config import Settings
-from codetr_ros.nodes.peers import Peers
+from codetr_ros.nodes.peers import Peer, Peers
+
+LEAVE_OUT_AFTER = 30.0
+"""Seconds of silence after which a source is left out, unless the user says otherwise: a node that
+was killed is started again before, and nobody has given up yet."""
+AWAY = 2.0
+"""Seconds between two looks, after which the one who looks was away himself: held, or busy. What
+came meanwhile has not been read, so that silence is counted from then on."""
 
 
-def silent_sources(peers: Peers, settings: Settings, now: float, after: float) -> list[str]:
-    """The sources of simulators that have published no presence for a while, or have ended.
+class Silence:
+    """How long simulators have published no presence.
 
     Args:
         peers: the nodes of the run.
         settings: its settings.
-        now: monotonic time [s].
-        after: seconds of silence; 0: nobody is silent, however long nothing comes.
+        after: seconds of silence after which a source is silent; 0: never.
     """
-    if not after:
-        return []
-    silent = [
-        peer.presence.node.rpartition('/')[2]
-        for peer in peers.alive('sim')
-        if peer.presence.finished or now - peer.received_at > after
-    ]
-    return [source for name in silent for source in settings.sources_of(name)]
+
+    def __init__(self, peers: Peers, settings: Settings, after: float) -> None:
+        self._peers = peers
+        self._settings = settings
+        self.after = after
+        self._looked = float('-inf')
+        self._since = float('-inf')  # from when on silence counts
+
+    def sources(self, now: float) -> dict[str, float]:
+        """The sources of simulators that are silent or have ended, and for how long [s].
+
+        Nobody is where nobody could be left out: with a single simulator there is nothing to go on
+        with, and at a free pace nobody is permitted anything.
+
+        Args:
+            now: monotonic time [s]. Call it often: see `AWAY`.
+        """
+        if now - self._looked > AWAY:
+            self._since = now
+        self._looked = now
+        settings = self._settings
+        if not self.after or settings.free or settings.simulators == 1:
+            return {}
+        return {
+            source: now - peer.received_at
+            for peer in self._peers.alive('sim')
+            if peer.presence.finished or self.silent(peer, now)
+            for source in settings.sources_of(peer.presence.node.rpartition('/')[2])
+        }
+
+    def silent(self, peer: Peer, now: float) -> bool:
+        """Whether nothing has come from a node for longer than it may be silent."""
+        return 0 < self.after < now - max(peer.received_at, self._since)

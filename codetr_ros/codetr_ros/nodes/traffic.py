@@ -103,6 +103,8 @@ class Traffic:
         recovered: records that were lost, and arrived when fetched again.
         ledger: counts of the records that peers have published.
         lost_for_good: records that will not arrive any more, once that is certain.
+        early: takes a record of a phase that cannot have begun yet, with the reason for which it
+            would be refused; returns whether it holds it. None: all of them are refused.
 
     Args:
         log: the node's logger.
@@ -128,6 +130,7 @@ class Traffic:
         self.recovered: Counter[str] = Counter()
         self.ledger = Ledger()
         self.lost_for_good: dict[str, int] | None = None
+        self.early: Callable[[Record, RecordError], bool] | None = None
         self._held: list[Record] | None = None
 
     def hold(self) -> None:
@@ -216,20 +219,31 @@ class Traffic:
         try:
             if self._holds_back(record):
                 return True
-            self._check_phase(record)
-            taker.receive(record)
+            if not self._came_early(record):
+                taker.receive(record)
         except RecordError as error:
             self.refuse(type(record), error)
             return False
         return taker.duplicated.total() == before
 
-    def _check_phase(self, record: Record) -> None:
+    def _came_early(self, record: Record) -> bool:
+        """Whether a record of a phase that cannot have begun yet is held by `early`.
+
+        Raises:
+            RecordError: it is of such a phase, and is not held.
+        """
         due, settings = self.core.due, self.settings
         if due is None or settings is None or not isinstance(record, PHASED):
-            return
+            return False
         # so many commits reach a node that was started again and takes in earlier phases
         late = LATE_COMMITS if isinstance(record, Commit) else 0
-        check_phase(record, due + late, settings)
+        try:
+            check_phase(record, due + late, settings)
+        except RecordError as error:
+            if self.early is None or not self.early(record, error):
+                raise
+            return True
+        return False
 
     def fetched(self, kind: type, data: bytes) -> Record:
         """The record in a message that was fetched again.

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from codetr_ros.bags.dropped import DroppedInBag
 from codetr_ros.bags.reader import Bag
 from codetr_ros.config import Settings, SettingsError, load
 from codetr_ros.offline import judged
@@ -26,6 +27,7 @@ UNKNOWN_TASK = 'unknown'
 """The task in the settings of a fit whose bags name none."""
 
 AGAIN = 'steps sent again'
+DROPPED = 'steps of sources that were left out of the phase'
 COPIES = 'steps of episodes that another bag holds too'
 UNSOUND = 'steps with values that are not finite'
 UNJOINED = 'breaks where the next observation is not the one before'
@@ -119,9 +121,13 @@ class Index:
         """
         kinds = (RunSpec, TaskSpec, Transitions, CompositeReward, Preference)
         for number, bag in enumerate(self.bags):
+            dropped = DroppedInBag(bag)
             for entry in bag.entries(kinds):
                 record = entry.record
                 if self.run_id is not None and record.run_id != self.run_id:
+                    continue
+                if dropped.holds(entry):
+                    self.skipped[DROPPED] += getattr(record, 'steps', 0)
                     continue
                 if isinstance(record, RunSpec):
                     self._run(number, record)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from codetr_ros.bags.dropped import undropped_entries
 from codetr_ros.bags.reader import Bag
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.offline.episodes import Key, Stretch, sound
@@ -107,7 +108,8 @@ def _load(
     true: dict[Stretch, F32] | None,
 ) -> None:
     due = {place: [_Filling(s, sizes) for s in some] for place, some in places.items()}
-    for entry in bag.entries((Transitions,) if true is None else (Transitions, TrueRewards)):
+    kinds = (Transitions,) if true is None else (Transitions, TrueRewards)
+    for entry in undropped_entries(bag, kinds):
         record = entry.record
         assert isinstance(record, Transitions | TrueRewards)
         place = (Key(number, record.run_id, record.source), record.episode)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from codetr_ros.bags.dropped import undropped_entries
 from codetr_ros.bags.reader import Bag
 from codetr_ros.records import CompositeReward, Transitions
 
@@ -48,7 +49,7 @@ def score_course(bag: Bag) -> ScoreCourse:
     chunks: dict[tuple[str, int], list[tuple[int, int]]] = {}  # first step and phase
     scores: list[CompositeReward] = []
     ends: Counter[tuple[str, int]] = Counter()
-    for entry in bag.entries((Transitions, CompositeReward)):
+    for entry in undropped_entries(bag, (Transitions, CompositeReward)):
         record = entry.record
         if isinstance(record, Transitions):
             key = record.source, record.episode

@@ -88,6 +88,7 @@ def commands(
     *,
     namespace: str | None = None,
     peer_deadline: float | None = None,
+    leave_out_after: float | None = None,
     robot: Mapping[str, str | bool] | None = None,
 ) -> list[Command]:
     """The processes of a run, in the order in which they start; any order would do.
@@ -100,6 +101,8 @@ def commands(
         namespace: that of the run; None: `namespace_of(run_id)`.
         peer_deadline: seconds that nodes wait for each other, 0 for ever; None: as they do by
             themselves.
+        leave_out_after: seconds of silence after which the recorder leaves a simulator of several
+            out, 0 never; None: as it does by itself.
         robot: parameters of the robot node, where the task is that of a robot.
 
     Raises:
@@ -125,6 +128,8 @@ def commands(
             arguments += ['-p', f'{parameter}:={json.dumps(value, ensure_ascii=False)}']
         if peer_deadline is not None:
             arguments += ['-p', f'peer_deadline:={float(peer_deadline)}']
+        if leave_out_after is not None and role == 'record':
+            arguments += ['-p', f'leave_out_after:={float(leave_out_after)}']
         processes.append(Command(name, role, tuple(arguments)))
     return processes
 

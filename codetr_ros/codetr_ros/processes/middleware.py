@@ -23,11 +23,11 @@ def wrong_namespace(given: str) -> str | None:
     )
 
 
-def wrong_seconds(flag: str, given: float) -> str | None:
+def wrong_seconds(flag: str, given: float, zero: str = 'for ever') -> str | None:
     """Why a value is no deadline of nodes; None if it is one."""
     if 0 <= given <= LONGEST_DEADLINE:
         return None
-    return f'{flag} {given:g} must be from 0 to {LONGEST_DEADLINE:g} seconds; 0: for ever'
+    return f'{flag} {given:g} must be from 0 to {LONGEST_DEADLINE:g} seconds; 0: {zero}'
 
 
 LONGEST_DEADLINE = 86_400.0

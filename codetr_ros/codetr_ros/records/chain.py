@@ -45,6 +45,13 @@ def named(commit: Commit) -> dict[Publisher, int]:
     }
 
 
+def void(commit: Commit) -> set[Publisher]:
+    """The publishers that a commit names whose numbers it voids: they were left out of the phase,
+    and none of their records is to come. Of scorers, these are simulators.
+    """
+    return {(kind, name) for kind, name in named(commit) if name in commit.dropped}
+
+
 def stated(commit: Commit) -> dict[Publisher, str]:
     """The digest that a commit states for each publisher that it names; empty where it states
     none.

@@ -31,20 +31,11 @@ _IDENTITY: dict[type, Callable[[Any], tuple[Any, ...]]] = {
     Commit: lambda r: (r.phase,),
     StepRewards: lambda r: (r.phase, r.part),
     ScoreRequest: lambda r: (r.phase,),
-    EpisodeResult: lambda r: (
-        r.source,
-        r.purpose,
-        r.purpose == 'training' or r.version,
-        r.episode,
-    ),
+    # in training too, numbers repeat: those of episodes whose steps were dropped
+    EpisodeResult: lambda r: (r.source, r.purpose, r.version, r.episode),
     TrueRewards: lambda r: (r.source, r.sequence),
     Metrics: lambda r: (r.role, r.node, r.phase, r.names),
 }
-
-
-def _version(result: EpisodeResult) -> int | None:
-    """The version that an episode evaluates; None in training, where numbers do not repeat."""
-    return None if result.purpose == 'training' else result.version
 
 
 def identity(record: Record) -> tuple[Any, ...]:

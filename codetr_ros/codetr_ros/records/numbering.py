@@ -15,12 +15,21 @@ class Numbering:
         self.early: set[int] = set()
         """Those that arrived before one below them."""
 
+    def skip(self, last: int) -> None:
+        """Go on behind a number: those up to there will not arrive."""
+        self.next = max(self.next, last + 1)
+        self.early = {number for number in self.early if number >= self.next}
+        self._advance()
+
     def take(self, number: int) -> bool:
         """Note a number that arrived; returns whether it is new."""
         if number < self.next or number in self.early:
             return False
         self.early.add(number)
+        self._advance()
+        return True
+
+    def _advance(self) -> None:
         while self.next in self.early:
             self.early.remove(self.next)
             self.next += 1
-        return True

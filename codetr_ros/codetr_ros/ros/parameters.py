@@ -21,6 +21,7 @@ from rclpy.parameter import Parameter
 from codetr_ros.config import Settings, SettingsError, load
 from codetr_ros.config.base import Whole
 from codetr_ros.config.threads import AUTO
+from codetr_ros.nodes.silence import LEAVE_OUT_AFTER
 
 Type = Parameter.Type
 NOT_GIVEN = 0.0
@@ -111,6 +112,11 @@ OWN_OF_ROLE: dict[str, dict[str, Own]] = {
         'bag': Own(
             '',
             'folder of the bag; empty: `bag` in `folder`; without a `folder` too: no bag',
+        ),
+        'leave_out_after': Own(
+            LEAVE_OUT_AFTER,
+            'seconds of silence after which a simulator of several is left out of the phase, so '
+            'that the run goes on without it; 0: never',
         ),
         'bag_split_mb': Own(
             1000.0,

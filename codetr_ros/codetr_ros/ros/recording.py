@@ -22,7 +22,9 @@ from codetr_ros.bags.topics import RECORDED, topics_of_run
 from codetr_ros.cores.beside import Beside, Early
 from codetr_ros.cores.recorder import Recorder
 from codetr_ros.nodes.kept_run import KeptRun
+from codetr_ros.nodes.peers import Peer
 from codetr_ros.nodes.settling import Settling
+from codetr_ros.nodes.silence import Silence
 from codetr_ros.records import (
     TOPICS,
     Commit,
@@ -55,7 +57,8 @@ class Recording(Wiring):
     def __init__(self, member: Membership, joined: Joined) -> None:
         super().__init__(member, joined)
         settings = joined.settings
-        self._settling = Settling(member.link.full_name, member.peers, member.limit)
+        self._silence = Silence(member.peers, settings, member.values['leave_out_after'])
+        self._settling = Settling(member.link.full_name, member.peers, member.limit, self._gone)
         names = {k: member.link.node.resolve_topic_name(TOPICS[k]) for k in RECORDED}
         self._bag = KeptRun(
             self._bag_folder(),
@@ -190,11 +193,15 @@ class Recording(Wiring):
             return False
         if not self._bag.repeats.knows(record):
             return False
+        core = cast(Recorder, self.joined.core)
+        if isinstance(record, TaskSpec) and record.source in core.absent:
+            core.receive(record)  # it is there again
+            return True
         permits = isinstance(record, Policy) and not self.joined.settings.free
         if permits and self._bag.repeats.differs(record):
             return False
         self._bag.repeats.note(record)  # which compares them
-        self.joined.core.duplicated[TOPICS[type(record)]] += 1
+        core.duplicated[TOPICS[type(record)]] += 1
         return True
 
     def _kept(self, record: Record, raw: bytes) -> bytes:
@@ -225,12 +232,36 @@ class Recording(Wiring):
     # ---- waiting
 
     def waits(self) -> str:
-        """What the recorder waits for, in words; what was lost on the way is asked for again."""
+        """What the recorder waits for, in words. What was lost on the way is asked for again, and
+        who is silent for too long is left out.
+        """
         core: Any = self.joined.core
+        self._leave_out()
         self._early = [record for record in self._early if core.comes_early(record)][-1:]
         lost = [TOPICS[type(record)] for record in self._early]
         self._ask_again([*lost, *self.member.traffic.lost()])
         return super().waits()
+
+    def _leave_out(self) -> None:
+        """Go on without simulators that are silent, if there are others."""
+        core = cast(Recorder, self.joined.core)
+        silent = self._silence.sources(time.monotonic())
+        for source in core.leave_out(silent):
+            self.log.warning(
+                f'{source} is left out of phase {core.phase}: nothing has come from it for '
+                f'{silent[source]:.0f} s (parameter leave_out_after: {self._silence.after:g} s). '
+                'Its steps of the phase are dropped; it joins again with a later one'
+            )
+            self.member.begin_counting_anew()  # what it has not sent yet is dropped
+
+    def _gone(self, peer: Peer, now: float) -> bool:
+        """Whether a node is silent and all that it simulates is left out: nobody waits for it."""
+        if peer.presence.role != 'sim':
+            return False
+        self._silence.sources(now)
+        sources = self.joined.settings.sources_of(peer.presence.node.rpartition('/')[2])
+        absent = cast(Recorder, self.joined.core).absent
+        return set(sources) <= absent and (peer.failed or self._silence.silent(peer, now))
 
     def _ask_again(self, lost: Collection[str]) -> None:
         """Ask those who publish on these topics for what was lost."""

@@ -8,8 +8,9 @@ work) for the phases that fill their memory.
 
 from collections.abc import Callable, Iterator
 from itertools import chain
-from typing import Any
+from typing import Any, cast
 
+from codetr_ros.cores.simulator import Simulator
 from codetr_ros.nodes.errors import NodeError
 from codetr_ros.records import (
     INITIAL_VERSION,
@@ -22,6 +23,7 @@ from codetr_ros.records import (
     Transitions,
     TrueRewards,
 )
+from codetr_ros.records.dropped import undropped
 from codetr_ros.records.fields import type_name
 from codetr_ros.ros.fetch import NEWEST, SERVICE, Answer, Asker
 from codetr_ros.ros.gathering import wait_for
@@ -100,6 +102,50 @@ def go_on(member: Membership, joined: Joined) -> bool:
     return True
 
 
+def newest_committed(
+    member: Membership, joined: Joined, answered: Callable[[int | None], None]
+) -> None:
+    """Ask the recorder for the last committed phase, and hand it over unless asked to stop.
+
+    Args:
+        member: the node that asks.
+        joined: its part of the run.
+        answered: takes the phase; None if none is committed.
+
+    Raises:
+        NodeError: the recorder does not answer.
+    """
+    try:
+        newest, _ = _Recorder(member, joined.run.run_id).ask(NEWEST, Commit)
+    except _StoppedError:
+        return
+    answered(newest)
+
+
+def take_place(member: Membership, joined: Joined) -> bool:
+    """Let a simulator that was left out go on where what is recorded of it ends.
+
+    Returns:
+        False if asked to stop meanwhile.
+
+    Raises:
+        NodeError: the recorder does not send what is needed.
+        TaskError: an environment is at fault.
+    """
+    core = cast(Simulator, joined.core)
+    recorder = _Recorder(member, joined.run.run_id)
+    try:
+        newest, _ = recorder.ask(NEWEST, Commit)
+        assert newest is not None  # a commit has let it in
+        core.begin_anew()
+        _restore_episodes(member, joined, newest, recorder)
+    except _StoppedError:
+        return False
+    core.resume(max(newest + 1, core.due))
+    member.log.info(f'joins the run again with phase {core.due}')
+    return True
+
+
 def _has_begun(member: Membership) -> bool:
     """Whether the recorder has published a commit."""
     commits = TOPICS[Commit]
@@ -124,11 +170,20 @@ def _reward(member: Membership, joined: Joined, newest: int, _: _Recorder) -> No
 
 def _simulator(member: Membership, joined: Joined, newest: int, recorder: _Recorder) -> None:
     core: Any = joined.core
+    _restore_episodes(member, joined, newest, recorder)
+    core.resume(newest + 1)
+
+
+def _restore_episodes(
+    member: Membership, joined: Joined, newest: int, recorder: _Recorder
+) -> None:
+    core: Any = joined.core
     sources = set(joined.settings.sources_of(member.link.name))
     phases: list[list[Record]] = []
     open_ = set(sources)  # whose episode under way begins in an earlier phase
     for phase in range(newest, -1, -1):
-        _, records = recorder.ask(phase, Transitions, TrueRewards, CompositeReward)
+        _, given = recorder.ask(phase, Transitions, TrueRewards, CompositeReward, Commit)
+        records = list(undropped(given))
         phases.append(records)
         open_ -= {
             record.source
@@ -139,7 +194,6 @@ def _simulator(member: Membership, joined: Joined, newest: int, recorder: _Recor
             break
     for record in chain.from_iterable(reversed(phases)):
         core.restore(record)
-    core.resume(newest + 1)
 
 
 def _robot_goes_on(member: Membership, joined: Joined) -> bool:

@@ -39,10 +39,8 @@ def at_the_end(run: 'Simulated') -> list[str]:
         found.append(f'gave up, though nothing happened that the run cannot mend: {reasons}')
     found += _weights(run)
     found += _uncounted(processes)
-    if run.dropped():
-        return found  # what is in a bag and was dropped is not compared
     found += _bag(run, whole=not gave_up)
-    if not gave_up:
+    if not gave_up and not run.dropped():  # what was dropped may have come too late for the bag
         found += _unrecorded(run)
     return found
 

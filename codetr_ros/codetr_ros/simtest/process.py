@@ -14,6 +14,8 @@ import numpy as np
 from codetr_ros.bags.definitions import encode
 from codetr_ros.config import Settings
 from codetr_ros.cores.core import Core
+from codetr_ros.cores.simulator import Simulator
+from codetr_ros.nodes.behind import Behind
 from codetr_ros.nodes.errors import NodeError
 from codetr_ros.nodes.fetching import Fetching
 from codetr_ros.nodes.patience import Limit, Patience
@@ -109,6 +111,8 @@ class Process:
         error: why it gave up; None if it has not.
         ended: whether it has taken its last turn.
         when_ended: called once it has.
+        newest_committed: returns the last committed phase, as its recorder answers.
+        when_displaced: called while it is permitted to go on after it was left out.
         repeated: second copies that it has taken, by topic.
 
     Args:
@@ -141,6 +145,8 @@ class Process:
         self.role, self.name, self.core = role, name, core
         self.error: Exception | None = None
         self.when_ended: Callable[[Process], None] = lambda process: None
+        self.newest_committed: Callable[[], int | None] = lambda: None
+        self.when_displaced: Callable[[Process], None] = lambda process: None
         self.ended = False
         self.finished = False  # the core was, when it ended
         self.repeated: Counter[str] = Counter()
@@ -158,6 +164,9 @@ class Process:
         self._settings = settings
         self._pace = pace
         self._work = core.work()
+        self._behind: Behind | None = None
+        if isinstance(core, Simulator):
+            self._behind = Behind(self.traffic, core, settings)
         self._patience = Patience(
             f'/{name}',
             self.peers,
@@ -225,7 +234,11 @@ class Process:
             return self.world.rng.expovariate(1 / self._pace.slice_seconds)
         now = self.world.now
         self._waiting = now if self._waiting is None else self._waiting
-        if self.core.finished:
+        if self._behind is not None and self._behind.asks:
+            self._behind.answered(self.newest_committed())
+        if isinstance(self.core, Simulator) and self.core.displaced:
+            self.when_displaced(self)
+        elif self.core.finished:
             self.doing = 'has finished'
             if self.settled(now - self._waiting):
                 self.end()
@@ -261,7 +274,6 @@ class Process:
             self.world.note(self.name, f'phase {packet.data.phase} came again')
             for kind, raw in packet.data.messages:
                 self.traffic.take_again(kind, raw)
-            self.core.fetched(packet.data.phase)
             self.core.fetched(packet.data.phase)
         else:
             self.take(packet.kind, packet.data)

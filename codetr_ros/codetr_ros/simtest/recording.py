@@ -12,7 +12,7 @@ from codetr_ros.cores.beside import Beside, Early
 from codetr_ros.cores.recorder import Recorder
 from codetr_ros.nodes.last_phases import LastPhases
 from codetr_ros.nodes.settling import Settling, still_missing
-from codetr_ros.nodes.silence import silent_sources
+from codetr_ros.nodes.silence import Silence
 from codetr_ros.records import TOPICS, Commit, Presence, Record, RunSpec, TaskSpec
 from codetr_ros.records.fields import type_name
 from codetr_ros.records.roles import published_by
@@ -39,7 +39,7 @@ class Recording(Process):
         self.disk = disk
         self.recorded: Counter[str] = Counter()
         self.history: list[tuple[type, bytes]] = []  # what the bag holds, in its order
-        self._settings_of_run, self._leave_out_after = settings, leave_out_after
+        self._silence = Silence(self.peers, settings, leave_out_after)
         self._full = {kind: f'/run/{TOPICS[kind]}' for kind in RECORDED}
         topics = [BagTopic(self._full[kind], type_name(kind), 16, False) for kind in RECORDED]
         self._bag = McapWriter(folder, topics, CHUNK_BYTES, keep_free=0, disk=disk)
@@ -100,8 +100,7 @@ class Recording(Process):
         self.publish(record, raw)
 
     def _do_turn(self) -> float | None:
-        now = self.world.now
-        silent = silent_sources(self.peers, self._settings_of_run, now, self._leave_out_after)
+        silent = self._silence.sources(self.world.now)
         for source in cast(Recorder, self.core).leave_out(silent):
             self.world.note(self.name, f'leaves {source} out')
         return super()._do_turn()

@@ -36,7 +36,5 @@ def replayed(
             if isinstance(record, core.subscribes) and not isinstance(record, StepRewards):
                 core.receive(record)
         work()
-        # who was permitted steps depends on when it announced itself again, which no record says
-        learner._intake.policies.clear()  # noqa: SLF001
     reward_model = None if labeller is None else labeller.report().reward_model_sha256
     return learner.report().policy_sha256, reward_model

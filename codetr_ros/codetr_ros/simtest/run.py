@@ -18,11 +18,11 @@ from codetr_ros.cores.core import Core
 from codetr_ros.cores.evaluator import Evaluator
 from codetr_ros.cores.labeller import Labeller
 from codetr_ros.cores.learner import Learner
-from codetr_ros.cores.left_out import LeftOutError, undropped
 from codetr_ros.cores.recorder import Recorder
 from codetr_ros.cores.simulator import Simulator
 from codetr_ros.nodes import errors
-from codetr_ros.records import Commit, Policy, Record, RunSpec
+from codetr_ros.records import Commit, Record, RunSpec
+from codetr_ros.records.dropped import undropped
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.simtest import checks
 from codetr_ros.simtest.disks import TroubledDisk
@@ -34,7 +34,6 @@ from codetr_ros.simtest.replay import replayed
 from codetr_ros.simtest.world import World
 
 RUN_ID = 'simtest'
-START_SECONDS = 1.0  # that a node takes to start again
 
 
 @dataclass(frozen=True)
@@ -110,7 +109,6 @@ class Simulated:
         run = settings.run_spec(RUN_ID)
         self.processes: dict[str, Process] = {}
         self.failures: list[str] = []
-        self._starting = 0  # nodes that will be there in a moment
         for name, role in names_of(settings).items():
             common = (
                 self.world, self.post, run, settings, role, name,
@@ -121,7 +119,8 @@ class Simulated:
             except Exception as error:  # noqa: BLE001 - a disk that is full from the beginning
                 made = Process(*common)
                 made.error = error
-            made.when_ended = self._start_again
+            made.newest_committed = self._newest_committed
+            made.when_displaced = self._take_place
             self.processes[name] = made
         self.post.processes = self.processes
         self.post.watch = self._watch
@@ -138,32 +137,19 @@ class Simulated:
             leave_out_after=self.plan.leave_out_after,
         )
 
-    def _start_again(self, ended: Process) -> None:
-        """Start a simulator again that was left out, as its launcher would."""
-        if isinstance(ended.error, LeftOutError):
-            self._starting += 1
-            self.world.at(self.world.now + START_SECONDS, lambda: self._restarted(ended))
+    def _newest_committed(self) -> int | None:
+        phase = cast(Recorder, self.processes['record'].core).phase
+        return phase - 1 if phase else None
 
-    def _restarted(self, ended: Process) -> None:
-        self._starting -= 1
-        settings, name = self.plan.settings, ended.name
-        core = Simulator(ended.run, settings, name)
-        there = [decode(kind, raw) for kind, raw in self.recording.history]
-        for record in undropped(there):
+    def _take_place(self, displaced: Process) -> None:
+        """Bring a simulator that was left out to where what was recorded of it ends."""
+        core = cast(Simulator, displaced.core)
+        committed = cast(Recorder, self.recording.core).phase
+        core.begin_anew()
+        for record in undropped(decode(kind, raw) for kind, raw in self.recording.history):
             core.restore(record)
-        due = cast(Recorder, self.recording.core).phase
-        core.resume(due)
-        for record in there:
-            if isinstance(record, Policy) and record.phase >= due:
-                core.receive(record)
-        pace = replace(self.plan.paces[name], begins=self.world.now)
-        again = Process(
-            self.world, self.post, ended.run, settings, 'sim', name, core, pace, DEADLINE,
-            ended.instance + 1,
-        )  # fmt: skip
-        again.when_ended = self._start_again
-        self.processes[name] = again
-        self.world.note(name, f'starts again, behind phase {due - 1}')
+        core.resume(max(committed, core.due))
+        self.world.note(displaced.name, f'goes on with phase {core.due}')
 
     @property
     def recording(self) -> Recording:
@@ -199,9 +185,7 @@ class Simulated:
         processes = self.processes.values()
         over = self.world.run(
             self.plan.longest,
-            lambda: (
-                bool(self.failures) or (not self._starting and all(p.ended for p in processes))
-            ),
+            lambda: bool(self.failures) or all(p.ended for p in processes),
         )
         for each in processes:
             each.core.close()

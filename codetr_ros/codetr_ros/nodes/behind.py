@@ -1,0 +1,58 @@
+"""Policies of phases that, as far as the simulator knows that receives them, cannot have begun."""
+
+from codetr_ros.config import Settings
+from codetr_ros.cores.simulator import Simulator
+from codetr_ros.nodes.traffic import Traffic
+from codetr_ros.records import Policy, Record, RecordError
+
+MOST = 64
+"""Policies that are held; the oldest are let go first."""
+
+
+class Behind:
+    """Holds such policies until the recorder has answered which phase is committed.
+
+    Either the simulator was left out meanwhile, and phases were committed without it: then it goes
+    on behind them. Or who published the policies had no right to: then they are refused.
+
+    Args:
+        traffic: hands records to the core.
+        core: the simulator's.
+        settings: of the run.
+    """
+
+    def __init__(self, traffic: Traffic, core: Simulator, settings: Settings) -> None:
+        self._traffic = traffic
+        self._core = core
+        self._held: dict[int, tuple[Policy, RecordError]] = {}  # with why it cannot be taken
+        if settings.simulators > 1:  # else no phase goes on without it
+            traffic.early = self._hold
+
+    def _hold(self, record: Record, error: RecordError) -> bool:
+        if not isinstance(record, Policy):
+            return False
+        self._held.setdefault(record.phase, (record, error))
+        while len(self._held) > MOST:
+            del self._held[min(self._held)]
+        return True
+
+    @property
+    def asks(self) -> bool:
+        """Whether the simulator waits for a policy while it holds later ones."""
+        return bool(self._held) and self._core.lacks_permission
+
+    def answered(self, newest: int | None) -> None:
+        """Go on where the run stands.
+
+        Args:
+            newest: the last committed phase; None if there is none.
+        """
+        held, self._held = self._held, {}
+        if newest is None or newest < self._core.due:
+            for _, error in held.values():
+                self._traffic.refuse(Policy, error)
+            return
+        self._core.pass_over(newest + 1)
+        for phase, (policy, _) in sorted(held.items()):
+            if phase > newest:
+                self._traffic.receive(policy)

@@ -1,0 +1,29 @@
+"""The wiring of a simulator's core: it joins the run again after it was left out."""
+
+from typing import cast
+
+from codetr_ros.cores.simulator import Simulator
+from codetr_ros.nodes.behind import Behind
+from codetr_ros.ros.joining import Joined
+from codetr_ros.ros.membership import Membership
+from codetr_ros.ros.restoring import newest_committed, take_place
+from codetr_ros.ros.wiring import Wiring
+
+
+class Simulating(Wiring):
+    """The wiring of a simulator's core."""
+
+    def __init__(self, member: Membership, joined: Joined) -> None:
+        super().__init__(member, joined)
+        self._core = cast(Simulator, joined.core)
+        self._behind = Behind(member.traffic, self._core, joined.settings)
+
+    def waits(self) -> str:
+        """What the simulator waits for, in words. If it was left out meanwhile, it goes on where
+        the run stands.
+        """
+        if self._behind.asks:
+            newest_committed(self.member, self.joined, self._behind.answered)
+        if self._core.displaced:
+            take_place(self.member, self.joined)
+        return super().waits()

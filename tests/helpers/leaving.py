@@ -1,0 +1,56 @@
+"""Simulated runs whose simulators fall silent, are left out and join again."""
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from codetr_ros.simtest.disks import Trouble
+from codetr_ros.simtest.network import Weather
+from codetr_ros.simtest.plan import Plan, all_settings, plan
+from codetr_ros.simtest.process import Pace
+from codetr_ros.simtest.run import Outcome, Simulated
+
+TWO = next(i for i, each in enumerate(all_settings()) if each.simulators == 2)
+FOUR = next(i for i, each in enumerate(all_settings()) if each.simulators == 4)
+
+
+def leaving(seed: int, stalls: dict[str, list[tuple[float, float]]], slow: str = '') -> Plan:
+    """A run of many phases whose learner takes its time, and whose simulators stall.
+
+    Args:
+        seed: of the plan.
+        stalls: from when and for how long simulators take no turn, by name [s].
+        slow: a simulator that takes so long for a chunk that it stalls within a phase.
+    """
+    planned = plan(seed)
+    settings = planned.settings.changed({'steps': 80, 'evaluate_every': 0, 'delay': 3})
+    paces = {name: Pace(slice_seconds=0.02) for name in planned.paces}
+    paces['learner'] = Pace(slice_seconds=1.0)
+    paces |= {
+        name: Pace(slice_seconds=0.2 if name == slow else 0.02, stalls=list(each))
+        for name, each in stalls.items()
+    }
+    weather = Weather(delay=0.01, reorder=True, doubled=0.1)
+    return replace(
+        planned,
+        settings=settings,
+        paces=paces,
+        weather=weather,
+        disk=Trouble(),
+        leave_out_after=3.0,
+        heals=True,
+    )
+
+
+def bag_with_dropped_steps(folder: Path) -> tuple[Simulated, Outcome]:
+    """A run from which `sim_2` was left out in the midst of a phase, and its bag in a folder."""
+    torch.set_num_threads(1)
+    before = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    try:
+        simulated = Simulated(leaving(TWO, {'sim_2': [(2.0, 6.0)]}, slow='sim_2'), folder, 100)
+        return simulated, simulated.run()
+    finally:
+        logging.disable(before)
