@@ -307,10 +307,13 @@ class Recorder(Part):
             seconds = time.perf_counter() - began
             step = self._settings.steps_after(phase)
             values = {'phase_seconds': seconds}
+            commit = self._commit(phase)
+            if self._settings.simulators > 1:
+                values['sources_left_out'] = len(commit.dropped)
             # the commit last: a bag that ends with it has all of the phase
             yield [
                 metrics(self._run.run_id, 'record', self._name, phase, step, values),
-                self._commit(phase),
+                commit,
             ]
         self.finished = True
         while True:

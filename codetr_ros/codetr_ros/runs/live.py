@@ -161,6 +161,7 @@ class Live:
             'steps_per_s': round(progress.rate, 1),
             'seconds_left': None if left is None else round(left, 1),
             'lost': progress.lost,
+            'left_out': dict(sorted(progress.leavers.since.items())),
             'nodes': self._who(),
         }
 

@@ -18,6 +18,7 @@ from codetr_ros.config import Settings
 from codetr_ros.records import Commit, EpisodeResult, Metrics, Presence, Record
 from codetr_ros.runs import references
 from codetr_ros.runs.display import Display
+from codetr_ros.runs.leavers import Leavers
 from codetr_ros.runs.numbers import exact, returns
 
 _RATE_WINDOW = 5  # phases over which the present speed is measured
@@ -64,6 +65,7 @@ class Progress(Display):
         self._present: dict[str, str] = {}  # node -> role
         self._note = 'starting'
         self._references = references.of(settings)
+        self.leavers = Leavers()
 
     def __enter__(self) -> 'Progress':
         super().__enter__()
@@ -79,6 +81,8 @@ class Progress(Display):
     def receive(self, record: Record) -> None:
         """Note a record of the run."""
         if isinstance(record, Commit):
+            for news in self.leavers.receive(record):
+                self.log(news)
             if record.phase >= self._phase:
                 self._phase = record.phase + 1
                 self._marks.append((self._clock(), self.steps))
@@ -150,6 +154,8 @@ class Progress(Display):
         if 'critic_loss' in self._metrics:
             facts.append(('critic loss', exact(self._metrics['critic_loss'], 4)))
         facts.append(('lost messages', str(self.lost)))
+        if out := self.leavers.now():
+            facts.append(('left out', out))
         spent = duration(self._clock() - self._began)
         facts.append(
             ('time', spent + (f', about {duration(left)} left' if left is not None else ''))
@@ -163,7 +169,7 @@ class Progress(Display):
     def _render(self) -> RenderableType:
         table = Table.grid(padding=(0, 2))
         for name, text in self._facts():
-            bad = name == 'lost messages' and self.lost > 0
+            bad = (name == 'lost messages' and self.lost > 0) or name == 'left out'
             table.add_row(Text(name, style='dim'), Text(text, style='bold red' if bad else ''))
         nodes = ', '.join(sorted(node.rsplit('/', 1)[-1] for node in self._present))
         notes = [f'{self._note}...'] if self._note else []

@@ -54,7 +54,16 @@ def result_rows(summary: RunSummary) -> list[tuple[str, str]]:
             f'{sum(row.published for row in summary.messages.values())} published, '
             f'{summary.lost} lost, {summary.duplicated} duplicated, {summary.refused} refused',
         ),
+        *_left_out(summary),
     ]
+
+
+def _left_out(summary: RunSummary) -> list[tuple[str, str]]:
+    """Who was left out of phases, and of how many."""
+    if not summary.left_out:
+        return []
+    words = ', '.join(f'{name}: {n} phases' for name, n in summary.left_out.items())
+    return [('left out, as nothing came from them', words)]
 
 
 def _recorded(summary: RunSummary) -> list[tuple[str, str]]:

@@ -163,6 +163,9 @@ class RunSummary(Facts):
     lost: int = Field(description='lost messages, all topics together')
     duplicated: int = Field(description='duplicated messages, all topics together')
     refused: int = Field(description='refused messages, all topics together')
+    left_out: Counts = Field(
+        {}, description='phases that each source was left out of, because nothing came from it'
+    )
     scorers: dict[str, ScorerRow] = Field(
         {}, description='who scored, by name, where others than the simulator did'
     )

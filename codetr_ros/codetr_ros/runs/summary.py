@@ -21,6 +21,7 @@ from codetr_ros.config import Settings
 from codetr_ros.records import Commit, EpisodeResult, Metrics, Record
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import run_summary, scorers, segments
+from codetr_ros.runs.leavers import Leavers
 from codetr_ros.runs.recovery import Recovery
 from codetr_ros.runs.reports import NodeReport
 from codetr_ros.runs.run_summary import Evaluation, RewardRecovery, RunSummary
@@ -110,6 +111,7 @@ class Summary:
         self._phases = 0
         self._before = 0  # steps of the run before its time began
         self._recovery = Recovery(settings, not in_process if recorded is None else recorded)
+        self._leavers = Leavers()
         self._wall: float | None = None  # seconds that the run took, once it is over
 
     def receive(self, record: Record) -> None:
@@ -137,6 +139,7 @@ class Summary:
                 self._metrics[record.phase][record.role, record.node, name] = value
         elif isinstance(record, Commit):
             self._phases = max(self._phases, record.phase + 1)
+            self._leavers.receive(record)
 
     @property
     def phases(self) -> int:
@@ -269,6 +272,7 @@ class Summary:
             lost=sum(row.lost for row in messages.values()),
             duplicated=sum(row.duplicated for row in messages.values()),
             refused=sum(row.refused for row in messages.values()),
+            left_out=self._leavers.phases,
             scorers=scorers.rows(
                 (name, value)
                 for _, values in sorted(self._metrics.items())

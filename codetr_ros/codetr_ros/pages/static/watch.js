@@ -83,12 +83,20 @@ function showStatus(status) {
   if (status.lost !== undefined && status.lost !== null) {
     facts.push(['messages lost', String(status.lost)]);
   }
+  const out = Object.entries(status.left_out ?? {});
+  if (out.length) {
+    const words = out.map(([name, phase]) => `${name} (since phase ${phase})`);
+    facts.push(['left out', words.join(', ')]);
+  }
   facts.push(['run as', status.in_process ? 'one process' : 'ROS 2 nodes']);
   if (status.namespace) facts.push(['namespace', status.namespace]);
   at('facts').replaceChildren(...facts.map(([name, text]) => make('div', {
     children: [
       make('dt', { text: name }),
-      make('dd', { text, className: name === 'messages lost' && status.lost ? 'bad' : '' }),
+      make('dd', {
+        text,
+        className: (name === 'messages lost' && status.lost) || name === 'left out' ? 'bad' : '',
+      }),
     ],
   })));
   showNodes(status);
