@@ -1,9 +1,13 @@
 """Policies of phases that, as far as the simulator knows that receives them, cannot have begun."""
 
+from typing import TYPE_CHECKING
+
 from codetr_ros.config import Settings
-from codetr_ros.cores.simulator import Simulator
 from codetr_ros.nodes.traffic import Traffic
 from codetr_ros.records import Policy, Record, RecordError
+
+if TYPE_CHECKING:  # its imports take seconds, and follow once the run is known
+    from codetr_ros.cores.simulator import Simulator
 
 MOST = 64
 """Policies that are held; the oldest are let go first."""
@@ -21,7 +25,7 @@ class Behind:
         settings: of the run.
     """
 
-    def __init__(self, traffic: Traffic, core: Simulator, settings: Settings) -> None:
+    def __init__(self, traffic: Traffic, core: 'Simulator', settings: Settings) -> None:
         self._traffic = traffic
         self._core = core
         self._held: dict[int, tuple[Policy, RecordError]] = {}  # with why it cannot be taken

@@ -8,9 +8,8 @@ work) for the phases that fill their memory.
 
 from collections.abc import Callable, Iterator
 from itertools import chain
-from typing import Any, cast
+from typing import Any
 
-from codetr_ros.cores.simulator import Simulator
 from codetr_ros.nodes.errors import NodeError
 from codetr_ros.records import (
     INITIAL_VERSION,
@@ -132,7 +131,7 @@ def take_place(member: Membership, joined: Joined) -> bool:
         NodeError: the recorder does not send what is needed.
         TaskError: an environment is at fault.
     """
-    core = cast(Simulator, joined.core)
+    core: Any = joined.core
     recorder = _Recorder(member, joined.run.run_id)
     try:
         newest, _ = recorder.ask(NEWEST, Commit)

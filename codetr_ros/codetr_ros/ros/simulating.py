@@ -1,13 +1,15 @@
 """The wiring of a simulator's core: it joins the run again after it was left out."""
 
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
-from codetr_ros.cores.simulator import Simulator
 from codetr_ros.nodes.behind import Behind
 from codetr_ros.ros.joining import Joined
 from codetr_ros.ros.membership import Membership
 from codetr_ros.ros.restoring import newest_committed, take_place
 from codetr_ros.ros.wiring import Wiring
+
+if TYPE_CHECKING:  # its imports take seconds, and follow once the run is known
+    from codetr_ros.cores.simulator import Simulator
 
 
 class Simulating(Wiring):
@@ -15,7 +17,7 @@ class Simulating(Wiring):
 
     def __init__(self, member: Membership, joined: Joined) -> None:
         super().__init__(member, joined)
-        self._core = cast(Simulator, joined.core)
+        self._core = cast('Simulator', joined.core)
         self._behind = Behind(member.traffic, self._core, joined.settings)
 
     def waits(self) -> str:
