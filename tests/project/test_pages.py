@@ -170,7 +170,15 @@ def test_the_nodes_and_parameters_that_pages_start_exist():
     known |= {('sim_node', launcher.ROBOT_NODE)}  # in place of a simulator
     settings = set(load('paper').flat())
     own = {'run_id', 'folder', 'peer_deadline', 'config', 'checkpoint', 'frozen'}
-    own |= {'bag', 'bag_split_mb', 'bag_keep_free_mb', 'mapping', 'autostart', 'real_time'}
+    own |= {
+        'bag',
+        'bag_split_mb',
+        'bag_keep_free_mb',
+        'leave_out_after',
+        'mapping',
+        'autostart',
+        'real_time',
+    }
     for page, command in QUOTED:
         if match := re.match(r'ros2 run (\w+) (\w+)', command):
             assert (match[1], match[2]) in known, (page, command)

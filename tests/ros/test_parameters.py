@@ -160,6 +160,7 @@ def test_own_parameters_have_types_and_ranges(make_node):
         'folder': '',
         'peer_deadline': 3.0,
         'bag': '',
+        'leave_out_after': 30.0,
         'bag_split_mb': 1000.0,
         'bag_keep_free_mb': 64.0,
     }

@@ -29,6 +29,7 @@ def recorder(play, tmp_path):
         'bag': str(tmp_path / 'bag'),
         'bag_split_mb': 0.0,
         'bag_keep_free_mb': 0.0,
+        'leave_out_after': 30.0,
     }
     member.announcement = member.link.message(play.spec)
     member.link.advertise(['run', 'commits'])

@@ -176,7 +176,7 @@ class Commit:
     transitions: I64  # (len(sources),) last sequence number of each source, -1 for none yet
     scorers: tuple[str, ...]
     scores: I64  # (len(scorers),) last sequence number of each scorer, -1 for none yet
-    dropped: tuple[str, ...]  # sources left out of the phase: silent beyond the deadline
+    dropped: tuple[str, ...]  # sources left out of the phase, and those not there again
     # digests as `records.digests` makes them; those of bags of protocol 1 are empty
     transition_digests: tuple[str, ...] = ()  # of each source
     score_digests: tuple[str, ...] = ()  # of each scorer
