@@ -6,7 +6,8 @@ import pytest
 from codetr_ros.config import SettingsError
 from codetr_ros.cores.evaluator import Evaluator
 from codetr_ros.policy.acting import ActingPolicy
-from codetr_ros.policy.actor import Actor, describe_network, weights_bytes
+from codetr_ros.policy.actor import Actor, weights_bytes
+from codetr_ros.policy.network import describe_network
 from codetr_ros.records import EpisodeResult, RecordError
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.simulation import tasks

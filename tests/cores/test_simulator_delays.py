@@ -7,7 +7,8 @@ from codetr_ros.config import SettingsError
 from codetr_ros.cores.evaluator import Evaluator
 from codetr_ros.cores.simulator import Simulator
 from codetr_ros.policy.acting import ActingPolicy
-from codetr_ros.policy.actor import Actor, describe_network, weights_bytes
+from codetr_ros.policy.actor import Actor, weights_bytes
+from codetr_ros.policy.network import describe_network
 from codetr_ros.records import CompositeReward, EpisodeResult, Transitions
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.simulation.composite import composite, perfect_score

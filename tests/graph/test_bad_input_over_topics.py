@@ -13,7 +13,8 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS')
 
 from codetr_ros.config import Settings
-from codetr_ros.policy.actor import Actor, describe_network, weights_bytes
+from codetr_ros.policy.actor import Actor, weights_bytes
+from codetr_ros.policy.network import describe_network
 from codetr_ros.records import (
     TOPICS,
     Commit,

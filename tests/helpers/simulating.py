@@ -4,7 +4,8 @@ import numpy as np
 
 from codetr_ros.config import Settings
 from codetr_ros.cores.simulator import Simulator
-from codetr_ros.policy.actor import Actor, describe_network, weights_bytes
+from codetr_ros.policy.actor import Actor, weights_bytes
+from codetr_ros.policy.network import describe_network
 from codetr_ros.records import (
     Metrics,
     TrueRewards,

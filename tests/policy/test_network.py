@@ -8,15 +8,9 @@ import pytest
 import safetensors.torch
 import torch
 
-from codetr_ros.policy.acting import ActingPolicy, NetworkError
-from codetr_ros.policy.actor import (
-    LOG_STD_RANGE,
-    Actor,
-    StandardisedActor,
-    describe_network,
-    linear_layers,
-    weights_bytes,
-)
+from codetr_ros.policy.acting import ActingPolicy
+from codetr_ros.policy.actor import Actor, StandardisedActor, linear_layers, weights_bytes
+from codetr_ros.policy.network import LOG_STD_RANGE, NetworkError, describe_network
 from codetr_ros.records import Policy
 
 OBS, ACT, HIDDEN = 7, 3, (32, 16)

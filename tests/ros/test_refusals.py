@@ -13,7 +13,7 @@ from codetr_ros.config import IN_PROCESS_ONLY, SettingsError, load
 from codetr_ros.cores.core import Part
 from codetr_ros.learners.sac import SacError
 from codetr_ros.nodes import errors
-from codetr_ros.policy.acting import NetworkError
+from codetr_ros.policy.network import NetworkError
 from codetr_ros.processes import middleware
 from codetr_ros.records import RecordError
 from codetr_ros.rewards.base import RewardModelError

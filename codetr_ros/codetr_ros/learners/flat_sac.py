@@ -23,7 +23,7 @@ from torch.optim.adam import adam
 from codetr_ros.config import SacSettings
 from codetr_ros.learners.sac import SAC, Adam, squashed_gaussian
 from codetr_ros.memory.batches import StepBatch
-from codetr_ros.policy.actor import LOG_STD_RANGE
+from codetr_ros.policy.network import LOG_STD_RANGE
 from codetr_ros.system import freed_memory
 from codetr_ros.system.compilation import compiled
 

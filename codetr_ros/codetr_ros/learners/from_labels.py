@@ -12,7 +12,8 @@ from codetr_ros.learners.device_sac import DeviceSAC
 from codetr_ros.learners.flat_sac import FlatSAC
 from codetr_ros.memory.ring import PROGRESS
 from codetr_ros.memory.trajectories import Trajectories
-from codetr_ros.policy.actor import Actor, describe_network
+from codetr_ros.policy.actor import Actor
+from codetr_ros.policy.network import describe_network
 
 
 class FromLabels(OffPolicy):

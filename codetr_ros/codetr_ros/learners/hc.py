@@ -49,7 +49,8 @@ from codetr_ros.learners.base import LearnerError, OffPolicy, add
 from codetr_ros.learners.histories import HISTORIES, HistoryBatch, ScoredSteps
 from codetr_ros.learners.sac import Adam, q_values, squashed_gaussian, twin_critic
 from codetr_ros.memory.trajectories import Trajectories
-from codetr_ros.policy.actor import Actor, describe_network
+from codetr_ros.policy.actor import Actor
+from codetr_ros.policy.network import describe_network
 from codetr_ros.system.states import check_state
 
 

@@ -70,18 +70,13 @@ from codetr_ros.learners.on_policy import (
 )
 from codetr_ros.memory.ring import Rollout
 from codetr_ros.memory.trajectories import Trajectories
-from codetr_ros.policy.actor import (
-    StandardisedActor,
-    describe_network,
-    layers,
-    orthogonal,
-    standardise,
-)
+from codetr_ros.policy.actor import StandardisedActor, layers, orthogonal, standardise
+from codetr_ros.policy.network import STANDARDISED, describe_network
 from codetr_ros.records import F32
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.system.states import check_state
 
-KIND = 'standardised_tanh_gaussian_mlp'
+KIND = STANDARDISED
 REWARD_CLIP = 10.0
 """Scaled composite rewards are clipped to this (baselines' VecNormalize)."""
 LARGEST_ACTION = 1 - 1e-6

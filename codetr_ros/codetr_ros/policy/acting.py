@@ -7,29 +7,26 @@ Shapes: O = observation size, A = action size.
 from typing import Any
 
 import numpy as np
-import safetensors
-import safetensors.torch
 import torch
 from torch import Tensor
 
 from codetr_ros.policy.actor import (
     KINDS,
-    LOG_STD_RANGE,
     Actor,
     StandardisedActor,
-    describe_network,
     linear_layers,
     standardise,
 )
+from codetr_ros.policy.network import (
+    LOG_STD_RANGE,
+    PLAIN,
+    Network,
+    NetworkError,
+    check_weights,
+    read_description,
+    read_weights,
+)
 from codetr_ros.records import F32, Policy
-from codetr_ros.system.parsing import parse_json
-
-MAX_LAYERS = 8
-MAX_WIDTH = 65_536
-
-
-class NetworkError(ValueError):
-    """A policy that cannot be used: names what was expected and what was received."""
 
 
 class ActingPolicy:
@@ -77,27 +74,23 @@ class ActingPolicy:
             raise NetworkError(
                 f'{name} is random and has no weights: draw its actions uniformly from [-1, 1]'
             )
-        description = _parse(policy.network, name)
-        hidden = _hidden(description, name)
+        description = read_description(policy.network, name)
         segment_steps = _segment_steps(description, name, delay)
         named = description.get('kind')
-        kind = next((kind for kind in KINDS if kind == named), 'tanh_gaussian_mlp')
-        expected = describe_network(observation_size, action_size, hidden, segment_steps, kind)
-        if policy.network != expected:
+        kind = next((kind for kind in KINDS if kind == named), PLAIN)
+        hidden = tuple(description['hidden'])
+        network = Network(kind, observation_size, action_size, hidden, segment_steps)
+        if policy.network != network.describe():
             raise NetworkError(
-                f'{name} is of another architecture: this task needs {expected}, '
+                f'{name} is of another architecture: this task needs {network.describe()}, '
                 f'the policy is {policy.network}; '
                 'learner and simulator need the same task and the same version of codetr_ros'
             )
-        try:
-            tensors = safetensors.torch.load(policy.weights)
-        except (safetensors.SafetensorError, KeyError) as error:
-            raise NetworkError(
-                f'{name}: its {len(policy.weights)} bytes of weights are not safetensors: {error}'
-            ) from None
+        weights = read_weights(policy.weights, name)
+        check_weights(weights, network, name)
         with torch.device('meta'):
-            actor = KINDS[kind](observation_size + (segment_steps > 0), action_size, hidden)
-        _check(tensors, actor.state_dict(), name)
+            actor = KINDS[kind](network.inputs, action_size, hidden)
+        tensors = {key: torch.from_numpy(array) for key, array in weights.items()}
         actor.load_state_dict(tensors, assign=True)
         return cls(actor, segment_steps)
 
@@ -144,37 +137,6 @@ def _own(tensor: Tensor) -> Tensor:
     return torch.empty(tensor.shape, dtype=tensor.dtype).copy_(tensor.detach())
 
 
-def _parse(network: str, name: str) -> dict[str, Any]:
-    """The content of a description."""
-    try:
-        description = parse_json(network)
-        if not isinstance(description, dict):
-            raise ValueError
-        if not {'hidden', 'segment_steps'} <= description.keys():
-            raise ValueError
-    except ValueError:
-        raise NetworkError(
-            f"{name}: its network description is not one of this version's: {network!r}; "
-            f'expected something like {describe_network(1, 1, [256, 256])}'
-        ) from None
-    return description
-
-
-def _hidden(description: dict[str, Any], name: str) -> list[int]:
-    """Hidden widths that a description names."""
-    hidden = description['hidden']
-    if (
-        not isinstance(hidden, list)
-        or not 1 <= len(hidden) <= MAX_LAYERS
-        or not all(type(width) is int and 1 <= width <= MAX_WIDTH for width in hidden)
-    ):
-        raise NetworkError(
-            f'{name}: its network description names hidden widths {hidden!r}; '
-            f'1 to {MAX_LAYERS} whole numbers from 1 to {MAX_WIDTH} are allowed'
-        )
-    return hidden
-
-
 def _segment_steps(description: dict[str, Any], name: str, delay: int) -> int:
     """Steps of the segments that a description names; 0 if the policy does not see them."""
     steps = description['segment_steps']
@@ -184,26 +146,6 @@ def _segment_steps(description: dict[str, Any], name: str, delay: int) -> int:
             f'{delay}: learner and simulator need the same setting delay'
         )
     return steps
-
-
-def _check(tensors: dict[str, Tensor], expected: dict[str, Tensor], name: str) -> None:
-    """Refuse weights that do not fit, before they are used."""
-    if tensors.keys() != expected.keys():
-        raise NetworkError(
-            f'{name}: missing weights {sorted(expected.keys() - tensors.keys())}, '
-            f'unknown weights {sorted(tensors.keys() - expected.keys())}'
-        )
-    for key, tensor in tensors.items():
-        actual = (str(tensor.dtype), tuple(tensor.shape))
-        due = ('torch.float32', tuple(expected[key].shape))
-        if actual != due:
-            raise NetworkError(f'{name}: weight {key!r} is {actual}, expected {due}')
-        strange = tensor.numel() - int(torch.isfinite(tensor).sum())
-        if strange:
-            raise NetworkError(
-                f'{name}: {strange} of {tensor.numel()} numbers of weight {key!r} are not finite; '
-                'the learner has diverged: look at its losses and the scale of its rewards'
-            )
 
 
 def uniform_actions(rng: np.random.Generator, steps: int, size: int) -> F32:

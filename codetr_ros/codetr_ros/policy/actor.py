@@ -4,52 +4,20 @@ Between them it travels as a JSON description and safetensors bytes, never as a 
 batch, O = observation size, A = action size, H = width of a hidden layer.
 """
 
-import json
 import math
 from collections.abc import Sequence
 from itertools import pairwise
 
-import safetensors
 import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-LOG_STD_RANGE = (-10.0, 2.0)
-"""Hard clip of the log standard deviation (jaxrl)."""
-OBSERVATION_CLIP = 10.0
-"""Standardised observations are clipped to this many deviations (baselines' VecNormalize)."""
-
-
-def describe_network(
-    observation_size: int,
-    action_size: int,
-    hidden: Sequence[int],
-    segment_steps: int = 0,
-    kind: str = 'tanh_gaussian_mlp',
-) -> str:
-    """The description of a policy network that goes into `Policy.network`: canonical JSON.
-
-    Two networks have the same description exactly if the weights of one fit the other and mean the
-    same.
-
-    Args:
-        observation_size: O of the task.
-        action_size: A of the task.
-        hidden: widths of the hidden layers.
-        segment_steps: steps n of the longest segment if the policy sees how far the segment is, as
-            one more input: (t - t_i) / n for step t of a segment that began at t_i. 0 if it does
-            not.
-        kind: the network's name in `KINDS`.
-    """
-    description = {
-        'kind': kind,
-        'observation_size': observation_size,
-        'action_size': action_size,
-        'hidden': list(hidden),
-        'segment_steps': segment_steps,
-        **KINDS[kind].constants,
-    }
-    return json.dumps(description, sort_keys=True, separators=(',', ':'))
+from codetr_ros.policy.network import (
+    LOG_STD_RANGE,
+    OBSERVATION_CLIP,
+    PLAIN,
+    STANDARDISED,
+)
 
 
 class Actor(nn.Module):
@@ -59,8 +27,6 @@ class Actor(nn.Module):
     deviation. Initial weights are orthogonal, with gain sqrt(2) in the network and 1 in each head;
     biases are zero.
     """
-
-    constants = {'activation': 'relu', 'log_std_range': list(LOG_STD_RANGE)}
 
     def __init__(self, observation_size: int, action_size: int, hidden: Sequence[int]) -> None:
         super().__init__()
@@ -90,7 +56,6 @@ class StandardisedActor(nn.Module):
     deviations are zero.
     """
 
-    constants = {'activation': 'tanh', 'observation_clip': OBSERVATION_CLIP}
     observation_mean: Tensor
     observation_deviation: Tensor
 
@@ -110,8 +75,8 @@ class StandardisedActor(nn.Module):
 
 
 KINDS: dict[str, type[Actor | StandardisedActor]] = {
-    'tanh_gaussian_mlp': Actor,
-    'standardised_tanh_gaussian_mlp': StandardisedActor,
+    PLAIN: Actor,
+    STANDARDISED: StandardisedActor,
 }
 """Policy networks by their name in a description."""
 

@@ -3,7 +3,8 @@
 from typing import Protocol
 
 from codetr_ros.config import Settings
-from codetr_ros.policy.acting import ActingPolicy, NetworkError
+from codetr_ros.policy.acting import ActingPolicy
+from codetr_ros.policy.network import NetworkError
 from codetr_ros.records import INITIAL_VERSION, Policy, Record, RecordError, RunSpec, describe
 from codetr_ros.records.checks import check_run
 
