@@ -12,7 +12,7 @@ from codetr_ros.records import F32, F64
 from codetr_ros.robots.errors import MessageError
 from codetr_ros.robots.mapping import Mapping
 from codetr_ros.robots.message_fields import NS, moment
-from codetr_ros.robots.values import Values, names_a_joint_twice, numbers
+from codetr_ros.robots.values import Values, joint_names, names_a_joint_twice, numbers
 
 NO_JOINTS = 'messages without all of the joints'
 JOINT_TWICE = 'messages that name one of the joints twice'
@@ -77,13 +77,23 @@ class Senses:
         array = numbers(message, values)
         before = self._held.get(place)
         if array is None:
-            self.counts[JOINT_TWICE if names_a_joint_twice(message, values) else NO_JOINTS] += 1
+            self._without_joints(message, values)
         elif not (np.abs(array) <= np.finfo(np.float32).max).all():
             self.counts[NOT_FINITE] += 1
         elif before is not None and len(before[1]) != len(array):
             self.counts[OTHER_SIZE] += 1
         elif before is None or at >= before[0]:  # one that comes late is older
             self._held[place] = (at, array)
+
+    def _without_joints(self, message: Any, values: Values) -> None:
+        """Count a message without one value for each joint; of what it has, the last is kept."""
+        twice = names_a_joint_twice(message, values)
+        self.counts[JOINT_TWICE if twice else NO_JOINTS] += 1
+        there = ', '.join(joint_names(message, values.topic)) or 'none'
+        wanted, fields = ', '.join(values.joints or ()), ', '.join(values.fields)
+        self.fault = (
+            f'{values.topic} names the joints {there}, and the mapping wants {fields} of {wanted}'
+        )
 
     def lacking(self) -> list[str]:
         """Topics from which nothing was received yet."""
@@ -112,11 +122,12 @@ class Senses:
     def size(self) -> int:
         """O, once something was received from every topic; 0 before."""
         if not self._size and not self.lacking():
-            self._size = self._sizes()
+            self._size = sum(self.sizes())
         return self._size
 
-    def _sizes(self) -> int:
-        return sum(len(self._held[i][1]) for i in range(len(self._rules.observation)))
+    def sizes(self) -> tuple[int, ...]:
+        """The numbers of each entry of the observation, once something was received from all."""
+        return tuple(len(self._held[i][1]) for i in range(len(self._rules.observation)))
 
     def positions(self) -> F64 | None:
         """The measured positions that were received last; None where the mapping has none."""

@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from codetr_ros.records import F64
 from codetr_ros.robots.errors import MessageError
@@ -25,6 +25,18 @@ class Values(Timed):
         'the field `name` of the message (sensor_msgs/JointState), or else by `joint_names` '
         '(trajectory_msgs/JointTrajectory)',
     )
+    units: tuple[str, ...] | None = Field(
+        None,
+        min_length=1,
+        description='the unit of each field, such as rad: nothing is converted, but a policy is '
+        'not let act where the mapping states another one',
+    )
+
+    @model_validator(mode='after')
+    def _unit_for_each_field(self) -> 'Values':
+        if self.units is not None and len(self.units) != len(self.fields):
+            raise ValueError(f'units has {len(self.units)} values, fields {len(self.fields)}')
+        return self
 
 
 def joint_names(message: Any, topic: str) -> list[str]:

@@ -23,10 +23,18 @@ import safetensors
 import safetensors.torch
 import torch
 
+from codetr_ros.runs import checkpoint_names
 from codetr_ros.system.files import make_folder, sync_folder, write_synced
 from codetr_ros.system.parsing import brief, parse_json, shortened
+from codetr_ros.system.tensors import Part
+from codetr_ros.system.tensors import digest as digest_of
 
 _log = logging.getLogger(__name__)
+every, latest, phase_of = (
+    checkpoint_names.every,
+    checkpoint_names.latest,
+    checkpoint_names.phase_of,
+)
 
 TENSORS = 'tensors.safetensors'
 DESCRIPTION = 'checkpoint.json'
@@ -55,13 +63,11 @@ class Checkpoint(NamedTuple):
 
 def digest(tensors: Mapping[str, torch.Tensor]) -> str:
     """sha256 over names (sorted), dtypes, shapes and bytes: equal weights give equal digests."""
-    total = hashlib.sha256()
-    for name in sorted(tensors):
-        tensor = tensors[name].detach().cpu().contiguous()
-        # A JSON line before the bytes keeps names, shapes and values apart.
-        total.update(json.dumps([name, str(tensor.dtype), list(tensor.shape)]).encode() + b'\n')
-        total.update(_bytes(tensor))
-    return total.hexdigest()
+    held = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    return digest_of(
+        Part(name, str(tensor.dtype), tensor.shape, _bytes(tensor))
+        for name, tensor in held.items()
+    )
 
 
 def _bytes(tensor: torch.Tensor) -> bytes:
@@ -138,7 +144,7 @@ def save(
     os.replace(partial, path)
     sync_folder(folder)
     _remove_partial(folder, name)
-    for old in _all(folder, name)[:-keep]:
+    for old in every(folder, name)[:-keep]:
         if old != path:  # after a return to an earlier phase the newest need not be the highest
             shutil.rmtree(old)
     return path
@@ -228,12 +234,6 @@ def _tensors(data: bytes, file: Path, remedy: str) -> dict[str, torch.Tensor]:
         ) from None
 
 
-def latest(folder: Path, name: str) -> Path | None:
-    """The whole checkpoint of this name with the highest phase, or None; `load` verifies it."""
-    checkpoints = _all(folder, name)
-    return checkpoints[-1] if checkpoints else None
-
-
 def _damaged(file: Path, actual: str, stored: str, remedy: str) -> str:
     return f'checkpoint file {file} is damaged: sha256 is {actual}, should be {stored}: {remedy}'
 
@@ -253,7 +253,7 @@ def sound(
         newest: the highest phase to look at; None: any.
         log: takes what is wrong with one.
     """
-    for path in reversed(_all(folder, name)):
+    for path in reversed(every(folder, name)):
         if newest is not None and phase_of(path) > newest:
             continue
         try:
@@ -268,7 +268,7 @@ def remove_after(folder: Path, name: str, phase: int) -> list[Path]:
     """Remove the checkpoints of later phases than this one, and return what they were: a run that
     has gone back to it makes them again.
     """
-    later = [path for path in _all(folder, name) if phase_of(path) > phase]
+    later = [path for path in every(folder, name) if phase_of(path) > phase]
     for path in later:
         shutil.rmtree(path)
     return later
@@ -277,19 +277,6 @@ def remove_after(folder: Path, name: str, phase: int) -> list[Path]:
 def of_model(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """Of a checkpoint's tensors those of what is trained, without those of the memory D."""
     return {name: value for name, value in tensors.items() if not name.startswith(OF_MEMORY)}
-
-
-def phase_of(path: Path) -> int:
-    """The phase after which the checkpoint in this folder was written."""
-    return int(path.name.rsplit('-', 1)[1])
-
-
-def _all(folder: Path, name: str) -> list[Path]:
-    """All whole checkpoints of exactly this name, lowest phase first."""
-    if not folder.is_dir():
-        return []
-    pattern = re.compile(re.escape(name) + r'-\d{6,}')
-    return sorted((p for p in folder.iterdir() if pattern.fullmatch(p.name)), key=phase_of)
 
 
 def _remove_partial(folder: Path, name: str) -> None:

@@ -25,6 +25,8 @@ MIDDLE = 'middle_policy'
 STATUS = 'status.json'
 EPISODE = 'newest_episode.json'
 TENSORBOARD = 'tensorboard'
+ROBOTS = 'robots'
+POLICY = 'policy.safetensors'
 
 
 class RunFolderError(ValueError):
