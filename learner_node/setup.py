@@ -10,7 +10,7 @@ version = ElementTree.parse(Path(__file__).resolve().parent / 'package.xml').fin
 setup(
     name=package_name,
     version=version,
-    description='Learns a policy from inferred step rewards and permits the phases of a run.',
+    description='Learns a policy from inferred step rewards; drives a robot by a trained one.',
     maintainer='The codetr_ros maintainers',
     maintainer_email='maintainers@codetr-ros.example',
     license='Apache-2.0',
@@ -21,5 +21,10 @@ setup(
     ],
     install_requires=['setuptools'],
     zip_safe=True,
-    entry_points={'console_scripts': ['learner = learner_node.learner:main']},
+    entry_points={
+        'console_scripts': [
+            'learner = learner_node.learner:main',
+            'act = learner_node.act:main',
+        ],
+    },
 )

@@ -22,7 +22,7 @@ EXECUTABLES = {
     'codetr_ros': {'codetr', 'record', 'score'},
     'sim_node': {'sim', 'evaluate', 'robot'},
     'reward_node': {'reward'},
-    'learner_node': {'learner'},
+    'learner_node': {'learner', 'act'},
 }
 
 

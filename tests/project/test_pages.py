@@ -139,7 +139,7 @@ def test_the_page_on_ros_names_every_topic_with_its_type_and_depth():
 
 @pytest.mark.skipif(not ROS, reason='rclpy is missing')
 def test_the_page_on_ros_names_every_parameter_of_the_nodes_with_its_default():
-    from codetr_ros.ros.parameters import own_parameters
+    from codetr_ros.ros.own_parameters import own_parameters
 
     roles = {'learner': 'learner', 'reward': 'reward', 'record': 'recorder', 'sim': ''}
     roles |= {'robot': 'robot'}

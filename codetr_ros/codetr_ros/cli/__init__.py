@@ -22,6 +22,7 @@ commands:
   watch      show a run in the browser, while it lasts or later
   score      score the segments of a run in the browser
   evaluate   evaluate the policy of a run's newest checkpoint
+  export     write the policy of a robot's run into a file to act by
   replay     derive a run's weights again from its bag, and compare them
   benchmark  do many runs under one protocol, and make a table of them
   bag        show, check, recover or play a bag
@@ -63,6 +64,12 @@ def _evaluate(arguments: Sequence[str]) -> int:
     from codetr_ros.cli import evaluate
 
     return evaluate.main(arguments)
+
+
+def _export(arguments: Sequence[str]) -> int:
+    from codetr_ros.cli import export
+
+    return export.main(arguments)
 
 
 def _report(arguments: Sequence[str]) -> int:
@@ -131,6 +138,7 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     'label': _label,
     'convert': _convert,
     'evaluate': _evaluate,
+    'export': _export,
     'report': _report,
     'watch': _watch,
     'replay': _replay,

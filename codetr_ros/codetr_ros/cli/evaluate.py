@@ -102,11 +102,27 @@ def settings_to_read(folder: Path) -> Settings:
     here.
 
     Raises:
+        RunFolderError: this is not the folder of a run, or of one on a robot.
+        SettingsError: its settings are refused.
+    """
+    settings = settings_here(folder)
+    if settings.on_robot:
+        raise RunFolderError(
+            f'{folder} has a run on a robot, {settings.task}, which nothing simulates: '
+            f'`codetr export {folder}` writes its policy into a file, to act by on the robot'
+        )
+    return settings.changed({'evaluate_every': 1}, str(folder))
+
+
+def settings_here(folder: Path) -> Settings:
+    """The settings of the run in this folder, changed so that its policy can be read here: that
+    needs neither the GPU that it was learnt on nor a compiler.
+
+    Raises:
         RunFolderError: this is not the folder of a run.
         SettingsError: its settings are refused.
     """
-    # reading a policy needs neither the GPU that it was learnt on nor a compiler
-    changes = {'evaluate_every': 1, 'device': 'cpu', 'sac.compile': False}
+    changes = {'device': 'cpu', 'sac.compile': False}
     return run_folder.read_settings(folder).changed(changes, str(folder))
 
 
@@ -137,7 +153,7 @@ def newest_policy(folder: Path, settings: Settings, place: Path | None = None) -
         )
     tensors, meta = checkpoints.load(path)
     phase = checkpoints.phase_of(path)
-    if not settings.evaluated(phase):
+    if phase < settings.warmup_phases - 1:
         raise RunFolderError(
             f'{path} is from the warm-up ({settings.warmup_steps} steps): '
             'its policy has learnt nothing yet'

@@ -7,6 +7,8 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Protocol
 
+import numpy as np
+
 from codetr_ros.records import F32, F64, Transitions
 from codetr_ros.robots.guard import SPEED, STOP, Guard, Hold
 from codetr_ros.robots.limits import Limiter
@@ -18,6 +20,7 @@ from codetr_ros.robots.steplog import StepLog
 
 NO_NEXT = 'steps without an observation after them'
 TOO_LATE = 'steps that were cut, as the next came too late'
+POLICY = 'policy'
 
 
 class Policy(Protocol):
@@ -127,7 +130,7 @@ class Control:
         if not self.running:
             self._try_to_begin(now)
         if self.running and observation is not None:
-            self._act(observation, now)
+            records += self._act(observation, now)
         self.scores.look(now)
         return records
 
@@ -180,14 +183,20 @@ class Control:
         elif not self.reset.silent:
             self._safe()
 
-    def _act(self, observation: F32, now: float) -> None:
+    def _act(self, observation: F32, now: float) -> list[Transitions]:
+        """Send what the policy asks for, within the limits; no limit holds what is no number."""
         wanted = self._policy.act(observation, self._log.length)
+        if not np.isfinite(wanted).all():
+            self.held = Hold(POLICY, f'the policy asks for {wanted.tolist()}, which is no action')
+            self._safe()
+            return self._end(now)
         made = self.limiter.command(wanted, self._sent, self.senses.positions())
         for name in made.changed_by:
             self.counts[f'commands changed by limit {name}'] += 1
         self._send(made.command)
         self._pending = (observation, made.action)
         self.scores.step_begun(now)
+        return []
 
     def _safe(self) -> None:
         command = self.limiter.safe(self.senses.positions())

@@ -216,7 +216,7 @@ def _content(data: bytes, name: str) -> tuple[dict[str, np.ndarray[Any, Any]], d
     except (safetensors.SafetensorError, KeyError, ValueError) as error:
         raise PolicyFileError(
             f'{name} is no policy file, or is damaged: its {len(data)} bytes are not safetensors '
-            f'({error}). {AGAIN.capitalize()}'
+            f'({error}): {AGAIN}'
         ) from None
     return held, metadata
 

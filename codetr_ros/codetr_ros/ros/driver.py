@@ -5,7 +5,7 @@ unconfigured, inactive once the robot's topics are there, active while it sends 
 store what arrived; only a stop acts at once.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -15,6 +15,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool, Trigger
 
+from codetr_ros.nodes.errors import NodeError
 from codetr_ros.records import F64
 from codetr_ros.robots.driving import Driving
 from codetr_ros.ros.commands import CommandMessages, message_class
@@ -31,6 +32,11 @@ SCORES_DEPTH = 1000
 class Driver(LifecycleNode):  # type: ignore[misc]
     """The topics and services of a robot.
 
+    Attributes:
+        types: the type of each topic that is subscribed to, once they are open.
+        expected: the types that topics must have, by name; the others may have any.
+        refusal: why the robot may not be driven yet; empty if it may.
+
     Args:
         link: the connection of the node beside it, which gives this one its turns.
         robot: what drives it.
@@ -46,6 +52,9 @@ class Driver(LifecycleNode):  # type: ignore[misc]
         )
         self._link = link
         self._robot = robot
+        self.types: dict[str, str] = {}
+        self.expected: Mapping[str, str] = {}
+        self.refusal = ''
         self._configured = False
         self._messages: CommandMessages | None = None
         self._publisher: Any = None
@@ -97,21 +106,23 @@ class Driver(LifecycleNode):  # type: ignore[misc]
     def _open(self) -> None:
         rules, live = self._robot.rules, self._robot.rules.live
         assert live is not None
+        types = dict(self.get_topic_names_and_types())
+        _check_command(types, rules.action.topic, live.command.type)
         size = self._robot.control.limiter.size
         self._messages = CommandMessages(rules.action, live.command, size, live.period)
         self._publisher = self.create_publisher(self._messages.type, rules.action.topic, 1)
         self._robot.send = self.send
-        types = dict(self.get_topic_names_and_types())
+        self.types = {t: self.expected.get(t, types[t][0]) for t in self.topics()}
         for topic in sorted(self._robot.senses.topics):
-            self._subscribe(types[topic][0], topic, self._sensed)
+            self._subscribe(topic, self._sensed)
         if rules.episode.topic:
-            self._subscribe(types[rules.episode.topic][0], rules.episode.topic, self._ended)
+            self._subscribe(rules.episode.topic, self._ended)
         if rules.score is not None:
             topic = rules.score.topic
-            self._subscribe(types[topic][0], topic, self._scored, self._lossless(topic))
+            self._subscribe(topic, self._scored, self._lossless(topic))
         heartbeat = live.watchdog.heartbeat
         if heartbeat:
-            self._subscribe(types[heartbeat][0], heartbeat, self._beat)
+            self._subscribe(heartbeat, self._beat)
         if live.stop.topic:
             self.create_subscription(Bool, live.stop.topic, self._stop_message, SENSOR)
         if live.reset.service:
@@ -119,12 +130,12 @@ class Driver(LifecycleNode):  # type: ignore[misc]
             self._robot.ask_for_reset = self._ask_for_reset
 
     def _subscribe(
-        self, type_name: str, topic: str, handle: Callable[..., None], quality: QoSProfile = SENSOR
+        self, topic: str, handle: Callable[..., None], quality: QoSProfile = SENSOR
     ) -> None:
         def store(message: Any) -> None:
             self._link.store(handle, topic, message, self._robot.clock())
 
-        self.create_subscription(message_class(type_name), topic, store, quality)
+        self.create_subscription(message_class(self.types[topic]), topic, store, quality)
 
     def _lossless(self, topic: str) -> QoSProfile:
         """A quality under which nothing is lost, if all who publish on a topic offer it."""
@@ -203,6 +214,9 @@ class Driver(LifecycleNode):  # type: ignore[misc]
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Drive the robot."""
+        if self.refusal:
+            self.get_logger().error(f'cannot be activated: {self.refusal}')
+            return TransitionCallbackReturn.FAILURE
         self._robot.activate()
         return super().on_activate(state)
 
@@ -223,6 +237,20 @@ class Driver(LifecycleNode):  # type: ignore[misc]
     def close(self) -> None:
         """Take the node off the graph."""
         self._link.release(self)
+
+
+def _check_command(types: Mapping[str, list[str]], topic: str, wanted: str) -> None:
+    """Refuse to command a robot that takes commands of another type: none would arrive.
+
+    Raises:
+        NodeError: names the topic, both types and the remedy.
+    """
+    there = types.get(topic, [])
+    if there and wanted not in there:
+        raise NodeError(
+            f'{topic} is of type {", ".join(there)} here, and the mapping commands it with '
+            f'live.command.type = {wanted}: correct the mapping, or start the driver of that robot'
+        )
 
 
 def shown(topics: Iterable[str]) -> str:

@@ -2,17 +2,38 @@
 
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, Protocol
 
 from codetr_ros.config import Settings
 from codetr_ros.nodes.errors import NodeError
 from codetr_ros.nodes.patience import NAME_EVERY
 from codetr_ros.records.roles import WRITERS, published_by, readers
+from codetr_ros.ros.link import Link
 from codetr_ros.ros.membership import Membership
+from codetr_ros.ros.signals import Stop
 
 IDLE = 0.05  # [s] to block in the executor when idle: the longest that a signal waits
 
 
-def wait_for(member: Membership, lacks: Callable[[], Sequence[str]]) -> bool:
+class Waiter(Protocol):
+    """A node that waits: a member of a run, or one that acts without any."""
+
+    stop: Stop
+    link: Link
+    log: Any
+    doing: str
+    waits_since: float | None
+    deadline_is: str
+
+    @property
+    def deadline(self) -> float:
+        """Seconds to wait; 0: for ever."""
+
+    def turn(self, wait: float = 0.0) -> None:
+        """Give ROS its turn, and block at most `wait` seconds for something to arrive."""
+
+
+def wait_for(member: Waiter, lacks: Callable[[], Sequence[str]]) -> bool:
     """Wait until nothing is lacking, and log what still is. False if asked to stop meanwhile.
 
     Args:

@@ -14,6 +14,7 @@ from rclpy.node import Node
 
 from codetr_ros.config import flatten
 from codetr_ros.ros import parameters
+from codetr_ros.ros.own_parameters import OWN_OF_ROLE
 from codetr_ros.system.parsing import ParseError, read_yaml
 from codetr_ros.system.similar import did_you_mean
 
@@ -31,8 +32,8 @@ def check_names(node: Node, role: str, arguments: Sequence[str] = ()) -> None:
     Raises:
         ParameterError: names all that were given to this node itself, and those that exist.
     """
-    known = set(parameters.FIELDS) | set(parameters.own_parameters(role))
-    others = {name for of_role in parameters.OWN_OF_ROLE.values() for name in of_role}
+    known = parameters.known(role)
+    others = {n for each in OWN_OF_ROLE for n in parameters.known(each)}
     unknown = {
         name: value
         for name, value in parameters.overrides(node).items()

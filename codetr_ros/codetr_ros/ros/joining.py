@@ -28,7 +28,7 @@ NAME_PATIENCE = 2.0  # [s] until the name of a node with known topics is known
 
 MakeCore = Callable[..., Core[Any]]
 """Makes the core of a node from (run, settings, name within the run, folder of checkpoints or
-None) and, by name, the node's own parameters that `parameters.core_parameters` lists."""
+None) and, by name, the node's own parameters that `own_parameters.core_parameters` lists."""
 
 LoadCore = Callable[[], MakeCore]
 """Does the slow imports (seconds) and returns what makes the core. Called once the run is known:

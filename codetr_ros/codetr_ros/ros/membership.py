@@ -34,6 +34,7 @@ from codetr_ros.records.roles import published_by
 from codetr_ros.ros import given, link, parameters
 from codetr_ros.ros.catching_up import OF_PHASES, Fetcher
 from codetr_ros.ros.link import Link
+from codetr_ros.ros.own_parameters import core_parameters
 from codetr_ros.ros.resend import serve_outbox
 from codetr_ros.ros.signals import Stop
 from codetr_ros.system.files import FileError, check_makeable
@@ -116,7 +117,7 @@ class Membership:
     @property
     def core_values(self) -> dict[str, Any]:
         """The node's own parameters with which its core is made."""
-        return {name: self.values[name] for name in parameters.core_parameters(self._kind)}
+        return {name: self.values[name] for name in core_parameters(self._kind)}
 
     @property
     def deadline(self) -> float:

@@ -10,27 +10,21 @@ of each environment in a simulator, one episode in the evaluator. A waiting node
 50 ms.
 """
 
-import gc
 import logging
-import os
 import resource
 import signal
-import sys
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
-import rclpy
-from rclpy.signals import SignalHandlerOptions
-
 from codetr_ros.nodes import errors
-from codetr_ros.processes import middleware
 from codetr_ros.records import TOPICS
-from codetr_ros.ros import joining, signals
+from codetr_ros.ros import joining
 from codetr_ros.ros.gathering import IDLE, wait_for
 from codetr_ros.ros.joining import Joined, LoadCore
 from codetr_ros.ros.membership import Membership
+from codetr_ros.ros.process import SHUTDOWN_DEADLINE, ToRos, in_ros
 from codetr_ros.ros.signals import Stop, Stopped
 from codetr_ros.ros.wiring import Wire, Wiring
 from codetr_ros.runs import folder as run_folder
@@ -40,8 +34,6 @@ from codetr_ros.runs.reports import CoreReport
 ACK_DEADLINE = 5.0  # [s] at the end for readers that still lack something
 STOPPED_DEADLINE = 0.5
 """The same [s] if the process was asked to stop. Who misses its leave takes it for dead."""
-SHUTDOWN_DEADLINE = 8  # [s] for the middleware to shut down, after everything is saved and sent:
-# well before `launcher.STOP_DEADLINE`, which counts from the signal
 LAST_PRESENCES = 5  # enough for the middleware to request acknowledgements
 
 
@@ -260,23 +252,6 @@ class Node:
             self._log.warning(f'not everybody has received everything on {", ".join(late)}')
 
 
-class _ToRos(logging.Handler):
-    """Hands what the library logs to the node's logger."""
-
-    def __init__(self, log: Any) -> None:
-        super().__init__()
-        self._log = log
-
-    def emit(self, record: logging.LogRecord) -> None:
-        # rclpy insists that one line of code logs with one severity
-        if record.levelno >= logging.ERROR:
-            self._log.error(self.format(record))
-        elif record.levelno >= logging.WARNING:
-            self._log.warning(self.format(record))
-        else:
-            self._log.info(self.format(record))
-
-
 def run_node(
     role: str,
     name: str,
@@ -301,28 +276,11 @@ def run_node(
         Exit code: 0, also after SIGINT or SIGTERM unless other nodes had failed before; 1 after an
         error; 2 for arguments that ROS cannot read.
     """
-    stop = stop or Stop().install()
-    stop.started()
-    for variable, value in middleware.DEFAULTS.items():
-        os.environ.setdefault(variable, value)
-    arguments = sys.argv if argv is None else [name, *argv]
     announce = joining.own_run if role == 'learner' else None
-    code: int | None = None
-    try:
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-    except RuntimeError as error:  # an argument, or a parameter file, that ROS cannot read
-        print(f'{name}: {error}', file=sys.stderr)
-        return 2
-    try:
+
+    def be_it(arguments: Sequence[str], stop: Stop) -> int:
         member = Membership(role, name, stop, arguments, kind)
-        logging.getLogger('codetr_ros').addHandler(_ToRos(member.log))
-        code = Node(member, lambda it: joining.join(it, load_core, announce), wire).run()
-        return code
-    finally:
-        rclpy.try_shutdown()
-        signals.ignore()
-        gc.freeze()  # or the interpreter's last collection goes through all of torch: 2 to 7 s
-        if stop.cut_short and code is not None:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(code)
+        logging.getLogger('codetr_ros').addHandler(ToRos(member.log))
+        return Node(member, lambda it: joining.join(it, load_core, announce), wire).run()
+
+    return in_ros(name, argv, stop, be_it)

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from typing import Any, cast
 
 from codetr_ros.cores.robot import Robot
+from codetr_ros.robots import robot_facts
+from codetr_ros.robots.robot_facts import RobotFacts
 from codetr_ros.ros.drive import Drive
 from codetr_ros.ros.gathering import IDLE, wait_for
 from codetr_ros.ros.joining import Joined
@@ -41,12 +43,23 @@ class RobotWiring(Wiring):
         assert drive is not None
         if not self._begun and driving.senses.size:
             self._begun = True
+            self._write(drive)
             drive.begin(self.member.values)
         newest = max((p.received_at for p in self.member.peers.alive('learner')), default=0.0)
         if newest != self._learner_at:
             self._learner_at = newest
             driving.guard.learner(driving.clock())
         drive.log_held()
+
+    def _write(self, drive: Drive) -> None:
+        """Write what the robot is into the folder of the run: its policy is for this robot."""
+        if self.member.folder is None:
+            return
+        driving = self._driving
+        made = RobotFacts(
+            mapping=driving.rules, types=drive.driver.types, sizes=driving.senses.sizes()
+        )
+        robot_facts.write(self.member.folder, self.member.link.name, made)
 
     def pause(self) -> float:
         """Seconds until the next control step is due, at most those that a signal waits."""
