@@ -85,7 +85,7 @@ def check_types(facts: RobotFacts, there: Mapping[str, Sequence[str]], policy: s
 
     Args:
         facts: of the robot in training.
-        there: the types of the topics that there are, by name.
+        there: the types of the topics that acting takes, by name.
         policy: name of the policy, for the error.
 
     Raises:

@@ -97,7 +97,9 @@ class Act:
         driver.expected = file.described.robot.types
         if not wait_for(self, driver.lacking):
             return
-        check_types(file.described.robot, dict(driver.get_topic_names_and_types()), file.name)
+        there = dict(driver.get_topic_names_and_types())
+        taken = {topic: there.get(topic, []) for topic in driver.topics()}
+        check_types(file.described.robot, taken, file.name)
         self._drive.configure()
         if not wait_for(self, self._unseen):
             return

@@ -218,6 +218,7 @@ class Driver(LifecycleNode):  # type: ignore[misc]
             self.get_logger().error(f'cannot be activated: {self.refusal}')
             return TransitionCallbackReturn.FAILURE
         self._robot.activate()
+        self.get_logger().info('the robot is driven from now on')
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
