@@ -94,7 +94,11 @@ class RobotRun(nodes.Nodes):
 
     def start_other(self, name: str, script: str, *arguments: str) -> None:
         """Start a process that is none of this project's."""
-        command = (sys.executable, str(EXAMPLE / script), *arguments)
+        self.start_python(name, str(EXAMPLE / script), *arguments)
+
+    def start_python(self, name: str, *arguments: str) -> None:
+        """Start a process of Python, as it is started outside of tests."""
+        command = (sys.executable, *arguments)
         others = launcher.Processes(print)
         logs = self.folder / run_folder.LOGS
         others.start([launcher.Command(name, 'robot', command)], logs, self._environment)

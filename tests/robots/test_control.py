@@ -71,11 +71,56 @@ def test_steps_of_an_episode_are_recorded_with_what_was_commanded():
 
 def test_what_is_recorded_is_the_command_after_the_limits():
     bench = Bench({'limits': {'change': 1.5}})  # 0.15 a step
-    bench.control.halt()  # the safe command was sent: the first change counts from there
     bench.step(6)
-    assert bench.sent[1:3] == [pytest.approx([0.15, -0.15]), pytest.approx([0.3, -0.3])]
+    assert bench.sent[:2] == [pytest.approx([0.15, -0.15]), pytest.approx([0.3, -0.3])]
     assert bench.records[0].actions[0] == pytest.approx([0.1, -0.075])
     assert bench.control.counts['commands changed by limit change'] == 6
+
+
+POSITION = {'topic': '/joint_states', 'fields': ['position'], 'joints': ['a', 'b']}
+BY_POSITION = {
+    'command': {'type': 'std_msgs/msg/Float64MultiArray', 'kind': 'position', 'safe': 'hold'},
+    'limits': {'change': 1.0, 'position': POSITION | {'low': -2.0, 'high': 2.0}},
+}
+
+
+def test_the_first_command_changes_no_faster_than_the_limit_from_where_the_robot_is():
+    bench = Bench(BY_POSITION)
+    bench.step()  # joint a is at 0.1, and the policy wants 0.75
+    assert bench.sent == [pytest.approx([0.2, -0.1])]
+    bench.step(2)
+    bench.control.deactivate(bench.now)
+    bench.now += 1.0  # somebody moves it meanwhile
+    bench.control.activate()
+    bench.step()
+    assert bench.sent[-1] == pytest.approx([1.3, -0.1])  # joint a is at 1.4
+
+
+def test_after_a_reset_in_which_it_moved_by_itself_a_robot_starts_from_where_it_is():
+    reset = {'by': 'service', 'service': '/reset'}
+    bench = Bench(BY_POSITION | {'reset': reset, 'episode_steps': 2})
+    bench.step()
+    bench.control.reset.answered(True)
+    bench.step(3)  # an episode, and the reset is asked for
+    bench.now = 0.0  # joint a goes back to its start
+    bench.senses.forget()
+    bench.control.reset.answered(True)
+    bench.step()
+    assert bench.sent[-1] == pytest.approx([0.2, -0.1])
+
+
+def test_what_a_policy_asks_for_is_no_command_where_it_is_no_number():
+    bench = Bench()
+    bench.step(3)
+    bench.act = lambda observation, step: np.array([np.nan, 0.5], np.float32)
+    bench.step()
+    assert bench.sent[-1] == SAFE
+    assert 'asks for [nan, 0.5], which is no action' in bench.control.held.why
+    assert (bench.records[0].steps, bench.records[0].truncated) == (3, True)
+    assert bench.control.counts['episodes cut by policy'] == 1
+    del bench.act
+    bench.step()
+    assert bench.sent[-1] == COMMAND
 
 
 def test_without_an_observation_the_safe_command_leaves_and_the_open_step_is_dropped():

@@ -72,7 +72,9 @@ class Control:
         self.running = False  # an episode is under way
         self.held: Hold | None = None
         self._pending: tuple[F32, F32] | None = None  # observation and action of a begun step
-        self._sent: F64 | None = None
+        self._sent: F64 | None = (
+            None  # the last command; None: the robot is at rest, for all one knows
+        )
         self._tick_at: float | None = None
         self._over = False  # a message has ended the episode
         self.counts: Counter[str] = Counter()
@@ -82,6 +84,7 @@ class Control:
     def activate(self) -> None:
         """Drive the robot from the next step on."""
         self.active = True
+        self._sent = None  # others may have moved it
         self.reset.begin()
 
     def deactivate(self, now: float) -> list[Transitions]:
@@ -180,7 +183,9 @@ class Control:
             self._log.begin()
             self.scores.begin(self._log.episode, now)
             self.running = True
-        elif not self.reset.silent:
+        elif self.reset.silent:
+            self._sent = None  # it moves by itself
+        else:
             self._safe()
 
     def _act(self, observation: F32, now: float) -> list[Transitions]:
@@ -190,7 +195,9 @@ class Control:
             self.held = Hold(POLICY, f'the policy asks for {wanted.tolist()}, which is no action')
             self._safe()
             return self._end(now)
-        made = self.limiter.command(wanted, self._sent, self.senses.positions())
+        positions = self.senses.positions()
+        before = self.limiter.rest(positions) if self._sent is None else self._sent
+        made = self.limiter.command(wanted, before, positions)
         for name in made.changed_by:
             self.counts[f'commands changed by limit {name}'] += 1
         self._send(made.command)

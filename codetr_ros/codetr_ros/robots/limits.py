@@ -71,7 +71,7 @@ class Limiter:
 
         Args:
             action: (A,) in [-1, 1], finite.
-            before: (A,) the last command that was sent; None where none was.
+            before: (A,) the last command that was sent, or what `rest` gives; None: not known.
             positions: (A,) as measured; None where the mapping names none.
         """
         asked = self.scaled(action)
@@ -103,6 +103,14 @@ class Limiter:
         else:
             room = np.where(up > 0, np.inf, 0.0), np.where(down < 0, -np.inf, 0.0)
         return [*bounds, (POSITION, room[1], room[0])]
+
+    def rest(self, positions: F64 | None) -> F64 | None:
+        """What a robot that has had no command is taken to do (A,): it holds the positions that
+        were measured, if it is driven by position, or obeys its safe command.
+        """
+        if self._kind == 'position' and positions is not None:
+            return positions.copy()
+        return self.safe(positions)
 
     def safe(self, positions: F64 | None) -> F64 | None:
         """The safe command (A,); None where it is to hold positions that were never measured."""
