@@ -63,6 +63,7 @@ class RobotRun(nodes.Nodes):
         folder: of the run.
         autostart: whether the robot moves without being activated.
         key: the key of the run; None: there is none.
+        simulated: whether the robot node takes its time from /clock.
         live: entries of the mapping's part `live`.
     """
 
@@ -72,13 +73,14 @@ class RobotRun(nodes.Nodes):
         folder: Path,
         autostart: bool = True,
         key: str | None = None,
+        simulated: bool = False,
         **live: Any,
     ) -> None:
         super().__init__(settings, folder)
         if key is not None:
             self._environment[signing.VARIABLE] = key
         file = mapping(folder, **live)
-        robot = {'mapping': str(file), 'autostart': autostart}
+        robot = {'mapping': str(file), 'autostart': autostart, 'use_sim_time': simulated}
         made = launcher.commands(settings, nodes.RUN_ID, folder, robot=robot)
         self._commands = {command.name: command for command in made}
         self.names = tuple(self._commands)

@@ -45,6 +45,14 @@ def test_by_header_the_age_is_that_of_the_stamp_and_a_late_message_is_no_newer()
     assert made.old(10.3) == ['/joint_states is 0.30 s old']
 
 
+def test_stamps_of_another_clock_are_named_as_such():
+    made = senses.Senses(rules(time='header'))
+    simulated = joints(1.0)
+    simulated.header = stamp(10.0)
+    made.take('/joint_states', simulated, 1.7e9)
+    assert 'its stamps are of another clock: set use_sim_time' in made.old(1.7e9)[0]
+
+
 @pytest.mark.parametrize(
     ('message', 'what'),
     [

@@ -14,7 +14,7 @@ from codetr_ros.records import F64, Transitions
 from codetr_ros.robots.control import Control, Policy
 from codetr_ros.robots.deadlines import Deadlines
 from codetr_ros.robots.errors import MessageError
-from codetr_ros.robots.guard import Guard
+from codetr_ros.robots.guard import Guard, Hold
 from codetr_ros.robots.live_scores import LiveScores
 from codetr_ros.robots.mapping import Mapping
 from codetr_ros.robots.reset import Resetting
@@ -134,6 +134,13 @@ class Driving:
     def stop(self, why: str) -> None:
         """Stop the robot at once, until a person lets it go on."""
         self.control.stop(why)
+
+    def interrupt(self, kind: str, why: str) -> None:
+        """Send the safe command at once, and end the episode with the next control step."""
+        self.guard.interrupted = Hold(kind, why)
+        self.control.halt()
+        if self.control.active:
+            self.control.held = self.guard.interrupted
 
     def stop_message(self, pressed: bool) -> None:
         """Take a message of the stop topic; true stops the robot at once."""

@@ -11,6 +11,7 @@ from codetr_ros.robots.senses import Senses
 
 STOP, PAUSE, SPEED = 'stop', 'pause', 'speed'
 OBSERVATION, HEARTBEAT, LEARNER = 'observation', 'heartbeat', 'learner'
+CLOCK = 'clock'
 
 
 class Hold(NamedTuple):
@@ -36,6 +37,8 @@ class Guard:
         self._pressed = False  # the stop topic has brought true, and no false since
         self._speed: str | None = None
         self.paused = False
+        self.interrupted: Hold | None = None
+        """Why the next control step is held, whatever it sees."""
         self.restart(now)
 
     def restart(self, now: float) -> None:
@@ -93,6 +96,9 @@ class Guard:
             self._speed = fast
         if self._speed is not None:
             return Hold(SPEED, self._speed)
+        if self.interrupted is not None:
+            held, self.interrupted = self.interrupted, None
+            return held
         if self.paused:
             return Hold(PAUSE, 'a person has paused it')
         if old := self._senses.old(now):

@@ -20,6 +20,8 @@ NOT_FINITE = 'messages with numbers that are not finite'
 OTHER_SIZE = 'messages with another number of values than before'
 UNREADABLE = 'messages without the fields of the mapping'
 AHEAD = 'messages stamped later than they came'
+A_DAY = 86_400.0  # [s]
+OTHER_CLOCK = ' (its stamps are of another clock: set use_sim_time, or `time: log` in the mapping)'
 
 
 class Senses:
@@ -108,7 +110,11 @@ class Senses:
             for i, values in enumerate(self._wanted)
             if i in self._held
         }
-        found = [f'{topic} is {age:.2f} s old' for topic, age in ages.items() if age > most]
+        found = [
+            f'{topic} is {age:.2f} s old' + (OTHER_CLOCK if age > A_DAY else '')
+            for topic, age in ages.items()
+            if age > most
+        ]
         return [*(f'{topic} has brought nothing' for topic in self.lacking()), *found]
 
     def observe(self, now: float) -> F32 | None:

@@ -5,13 +5,15 @@ import time
 from typing import Any
 
 from codetr_ros.robots.driving import Driving
-from codetr_ros.robots.guard import Hold
+from codetr_ros.robots.guard import CLOCK, Hold
 from codetr_ros.robots.reset import RESET
 from codetr_ros.ros.driver import Driver, shown
 from codetr_ros.ros.link import Link
 from codetr_ros.system.scheduling import real_time
 
 SAY_EVERY = 10.0  # [s] between two lines about the same reason for which the robot is held
+STILL = 1.0
+"""Seconds of the machine for which a simulated clock may stand still before the robot is held."""
 
 
 class Drive:
@@ -26,7 +28,9 @@ class Drive:
         self._driving = driving
         node = link.node
         self._log = node.get_logger()
-        if node.get_parameter('use_sim_time').value:
+        self._simulated = bool(node.get_parameter('use_sim_time').value)
+        self._ticked = 0.0, time.monotonic()  # the simulated time [s], and since when it stands
+        if self._simulated:
             driving.use_clock(lambda: node.get_clock().now().nanoseconds / 1e9)
         else:
             # never set back while the node runs, and comparable with stamps of the system's clock
@@ -44,6 +48,7 @@ class Drive:
         """
         self.driver.on_configure(None)  # raises what is wrong; a transition would hide it
         self.driver.trigger_configure()
+        self._driving.use_clock(self._driving.clock)  # a simulated one has jumped from 0
         self._log.info(f'observes {shown(self.driver.topics())}')
 
     def begin(self, values: dict[str, Any]) -> None:
@@ -53,7 +58,7 @@ class Drive:
             values: the node's own parameters `autostart` and `real_time`.
         """
         gc.freeze()  # nothing may delay a control step, and a collection goes through all of torch
-        if values['real_time'] and (reason := real_time()):
+        if values['real_time'] and not self._simulated and (reason := real_time()):
             self._log.warning(f'control steps have no real-time scheduling: {reason}')
         if values['autostart']:
             self.driver.trigger_activate()
@@ -64,9 +69,20 @@ class Drive:
             )
 
     def log_held(self) -> None:
-        """Log why the robot is held."""
+        """Log why the robot is held, and hold it where a simulated clock has stopped."""
+        if self._simulated:
+            self._watch_clock()
         control = self._driving.control
         self._note(control.held if control.active else None)
+
+    def _watch_clock(self) -> None:
+        """Send the safe command where the clock has stopped: no control step is due any more."""
+        now, wall = self._driving.clock(), time.monotonic()
+        simulated, since = self._ticked
+        if now != simulated:
+            self._ticked = now, wall
+        elif wall - since > STILL and not self._driving.guard.interrupted:
+            self._driving.interrupt(CLOCK, f'/clock stood still for more than {STILL:g} s')
 
     def _note(self, held: Hold | None) -> None:
         """Log why the robot is held: at once, and again while it lasts; a reset, which every

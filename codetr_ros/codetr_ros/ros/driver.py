@@ -81,9 +81,12 @@ class Driver(LifecycleNode):  # type: ignore[misc]
         return {topic for topic in wanted if topic is not None}
 
     def lacking(self) -> list[str]:
-        """The topics that nobody publishes yet, in words."""
+        """The topics that nobody publishes yet, in words; a simulated clock among them."""
         there = dict(self.get_topic_names_and_types())
-        return [
+        clock = self.get_clock()
+        lacks_time = clock.ros_time_is_active and not clock.now().nanoseconds
+        waits = ['the time on /clock, which use_sim_time asks for'] if lacks_time else []
+        return waits + [
             f'a node that publishes {topic}, which the mapping names'
             for topic in sorted(self.topics())
             if not there.get(topic)
