@@ -18,6 +18,7 @@ MODULES = {
     'sim': 'sim_node.sim',
     'learner': 'learner_node.learner',
     'reward': 'reward_node.reward',
+    'score': 'codetr_ros.ros.score',
     'deaf': 'helpers.deaf',
     'imports': 'helpers.slow_import',
     'compiles': 'helpers.slow_import:compiling',

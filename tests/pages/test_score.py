@@ -150,6 +150,43 @@ def test_the_page_can_be_used_at_400_pixels_and_by_keyboard_alone(tab):
         opened.get_by_text('Number 0: 3').wait_for()
 
 
+@pytest.mark.parametrize('width', [400, 1200])
+def test_why_nothing_is_taken_is_shown_in_place_of_what_could_be_stated(tab, width):
+    desk = a_desk()
+    with served(desk) as (server, page):
+        opened = tab(server.url, width=width)
+        opened.get_by_role('button', name='4', exact=True).wait_for()
+        desk.refuse('the run has a key, and this process has none. Set CODETR_RUN_KEY' + 40 * 'x')
+        page.tick()
+        alert = opened.get_by_text('Nothing that you state is taken: the run has a key')
+        alert.wait_for()
+        assert alert.get_attribute('role') == 'alert'
+        assert opened.evaluate('document.documentElement.scrollWidth') <= width
+        assert not opened.get_by_role('button', name='4', exact=True).is_visible()
+        opened.keyboard.press('4')
+        assert given(desk) == []
+
+
+def test_what_later_phases_did_not_take_is_counted_on_the_page(tab):
+    desk = a_desk()
+    with served(desk) as (server, page):
+        opened = tab(server.url, width=400)
+        opened.get_by_role('button', name='4', exact=True).click()
+        opened.get_by_text('Number 0: 4').wait_for()
+        none = {'scorers': (), 'scores': np.array([], np.int64)}
+        for phase in range(SETTINGS.ahead + 2):
+            desk.receive(commit(phase=phase, **none))
+            page.tick()
+            assert desk.document()['passed_over'] == (phase > SETTINGS.ahead)
+        opened.get_by_text(
+            '1 of your statements were taken by none of the phases since'
+        ).wait_for()
+        assert opened.evaluate('document.documentElement.scrollWidth') <= 400
+        desk.receive(commit(phase=4, scorers=('ann',), scores=np.array([0], np.int64)))
+        page.tick()
+        opened.locator('#passed').wait_for(state='hidden')
+
+
 def test_names_of_a_run_are_shown_as_text_and_never_run(tab):
     nasty = tiny(scorer='person', task='InvertedPendulum-v5')
     desk = Desk(run(nasty), nasty, '<img src=x onerror="document.title=1">')

@@ -1,11 +1,12 @@
-"""Pages beside `codetr train`: served by processes of their own, so that the run goes on as it
-does without.
+"""Pages and services beside `codetr train`: each of a process of its own, so that the run goes on
+as it does without.
 """
 
 import os
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
@@ -15,18 +16,19 @@ from codetr_ros.processes.launcher import end_with_parent
 from codetr_ros.runs import folder as run_folder
 
 PROGRAM = (sys.executable, '-m', 'codetr_ros.cli')
-LOG, SCORE_LOG = 'watch.log', 'score.log'
+LOG, SCORE_LOG, SERVICE_LOG = 'watch.log', 'score_page.log', 'score_service.log'
 STOP_DEADLINE = 10.0
 """Seconds in which the page ends when asked to; then it is killed."""
 
 
 class Beside:
-    """Serves a page of a run while it lasts. A context manager.
+    """Serves something of a run while it lasts. A context manager.
 
     Args:
         folder: of the run.
         log: prints a line for people, such as the address of the page.
-        program: what serves the page; None: the page of `codetr watch`.
+        name: of the file, among the run's logs, that takes its errors.
+        program: what serves the page.
         environment: variables of the program; None: those of this process.
     """
 
@@ -34,13 +36,14 @@ class Beside:
         self,
         folder: Path,
         log: Callable[[str], None],
-        program: Sequence[str] | None = None,
+        name: str,
+        program: Sequence[str],
         environment: Mapping[str, str] | None = None,
     ) -> None:
         self._log = log
-        self._program = (*PROGRAM, 'watch', str(folder)) if program is None else program
+        self._program = program
         self._environment = environment
-        self._place = folder / run_folder.LOGS / (LOG if program is None else SCORE_LOG)
+        self._place = folder / run_folder.LOGS / name
         self._told = b''  # what it has printed so far
         self._known = False  # its address was printed, or why there is none
 
@@ -91,28 +94,53 @@ class Beside:
         self._process.stdout.close()
 
 
+@dataclass(frozen=True)
+class Offered:
+    """What is served beside a run.
+
+    Attributes:
+        watch: a page that shows it.
+        score: a page for a person who scores, though the run asks for none.
+        service: the services for programs that score.
+        open: whether the pages are opened in a browser.
+    """
+
+    watch: bool = False
+    score: bool = False
+    service: bool = False
+    open: bool = False
+
+
 def pages(
     folder: Path,
     settings: Settings,
     log: Callable[[str], None],
-    watch: bool,
+    offered: Offered,
     namespace: str | None,
     key: Mapping[str, str],
 ) -> list[Beside]:
-    """The pages that are served beside a run.
+    """What is served beside a run.
 
     Args:
         folder: of the run.
         settings: of the run; where a person scores, there is a page for it.
         log: prints a line for people.
-        watch: whether somebody wants to watch the run.
+        offered: what somebody wants.
         namespace: of the nodes; None: there are none.
         key: the variable with the key of the run, without which no score is taken.
     """
-    beside = [Beside(folder, log)] if watch else []
-    if settings.scorer == 'person' and namespace is not None:
+    opened = ('--open',) if offered.open else ()
+    beside = []
+    if offered.watch:
+        beside.append(Beside(folder, log, LOG, (*PROGRAM, 'watch', str(folder), *opened)))
+    if namespace is None:
+        return beside
+    environment = launcher.environment(settings) | dict(key)
+    program = (*PROGRAM, 'score', namespace)
+    if offered.score or settings.scorer == 'person':
         name = settings.scorers[0] if settings.scorers else 'person'
-        program = (*PROGRAM, 'score', namespace, '--name', name)
-        environment = launcher.environment(settings) | dict(key)
-        beside.append(Beside(folder, log, program, environment))
+        page = (*program, '--name', name, *opened)
+        beside.append(Beside(folder, log, SCORE_LOG, page, environment))
+    if offered.service:
+        beside.append(Beside(folder, log, SERVICE_LOG, (*program, '--service'), environment))
     return beside

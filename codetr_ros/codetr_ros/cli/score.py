@@ -2,39 +2,43 @@
 
 import dataclasses
 import logging
-import re
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import tyro
 
-from codetr_ros.cli import refuse
+from codetr_ros.cli import FAILED, browser, refuse
 from codetr_ros.cli.terminal import console, parse_arguments
-from codetr_ros.cli.watch import AllowedNames, Host, Port
+from codetr_ros.cli.watch import AllowedNames, Host, Open, Port
 from codetr_ros.processes import middleware
 
 if TYPE_CHECKING:
     from codetr_ros.config import Settings
     from codetr_ros.cores.core import Core
-    from codetr_ros.cores.scoring import Desk, Segment
+    from codetr_ros.cores.scoring import Desk
+    from codetr_ros.cores.seen import Segment
+    from codetr_ros.pages.scoring import Points
     from codetr_ros.records import RunSpec
-    from codetr_ros.ros.joining import MakeCore
+    from codetr_ros.ros.joining import Joined, MakeCore
+    from codetr_ros.ros.membership import Membership
+    from codetr_ros.ros.wiring import Wiring
 
 _log = logging.getLogger(__name__)
 DRAWING_DEADLINE = 60.0
 """Seconds in which a segment must be drawn."""
-NAME = re.compile('[A-Za-z0-9_-]{1,64}')
+SERVICE_NODE = 'score_service'
 
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
     """Score the segments of a run in the browser, over its topics, on this or another computer.
-    The run goes on without waiting. It must have been started with --scorer person or topic.
-    Ctrl-C ends it; who comes back under the same name goes on.
+    The run goes on without waiting. It must have been started with --scorer person, topic or
+    simulated. Ctrl-C ends it; who comes back under the same name goes on. --service serves
+    programs that score, in place of a page.
     """
 
     namespace: Annotated[
@@ -52,9 +56,17 @@ class Arguments:
             help='3 to 9 points, the highest is best; or number, for any number',
         ),
     ] = '1:5'
+    service: Annotated[
+        bool,
+        tyro.conf.arg(
+            help='serve no page but the services score_segment and wanted_segments, to all who '
+            'know the token that is printed; each names himself'
+        ),
+    ] = False
     host: Host = '127.0.0.1'
     port: Port = 0
     allow_name: AllowedNames = ()
+    open: Open = False
     peer_deadline: Annotated[
         float, tyro.conf.arg(metavar='S', help='seconds to wait for the run; 0: for ever')
     ] = 60.0
@@ -63,16 +75,14 @@ class Arguments:
 def main(arguments: Sequence[str]) -> int:
     """Serve the page until the run has ended, or Ctrl-C; returns the exit code."""
     given = parse_arguments(Arguments, prog='codetr score', arguments=arguments)
+    from codetr_ros.cores.desks import misnamed
     from codetr_ros.pages.address import PageError
     from codetr_ros.pages.scoring import Points
 
-    if not NAME.fullmatch(given.name):
-        return refuse(
-            f'--name {given.name!r}: a scorer is named by 1 to 64 letters, digits, underscores '
-            'and hyphens'
-        )
-    reason = middleware.wrong_namespace(given.namespace) or middleware.wrong_seconds(
-        '--peer-deadline', given.peer_deadline
+    reason = (
+        ((wrong := misnamed(given.name)) and f'--name {wrong}')
+        or middleware.wrong_namespace(given.namespace)
+        or middleware.wrong_seconds('--peer-deadline', given.peer_deadline)
     )
     if reason:
         return refuse(reason)
@@ -81,37 +91,67 @@ def main(arguments: Sequence[str]) -> int:
     except PageError as error:
         return refuse(str(error))
     try:
+        from codetr_ros.ros import score
         from codetr_ros.ros.node import run_node
     except ImportError as error:
         return refuse(
             f'ROS cannot be imported ({error}): a run is scored over its topics. `codetr doctor` '
             'names what is missing'
         )
-    node = 'score_' + given.name.replace('-', '_')
     ros = ['--ros-args', '-r', f'__ns:={given.namespace}', '-p']
     argv = [*ros, f'peer_deadline:={given.peer_deadline}']
+    if given.service:
+        return run_node('score', SERVICE_NODE, score.load_services, argv, wire=score.wire)
+    page = Page(given, points)
+    node = 'score_' + given.name.replace('-', '_')
+    code = run_node('score', node, page.load, argv, wire=page.wire, looks_on=True)
+    return code or (FAILED if page.problem else 0)
 
-    def show(url: str) -> None:
-        console().print(f'score as {given.name} at {url} (Ctrl-C ends it)')
 
-    return run_node('score', node, loading(given, points, show), argv)
-
-
-def loading(
-    given: Arguments, points: Any, show: Callable[[str], None]
-) -> 'Callable[[], MakeCore]':
-    """What imports and makes the core of the node: a desk, and the page that it is served on.
+class Page:
+    """The page of a scorer: what makes the core of its node, and its wiring.
 
     Args:
         given: the command line.
         points: the person's scale.
-        show: prints the address of the page.
+
+    Attributes:
+        problem: why the run takes nothing of this scorer; None: it does.
     """
 
-    def load() -> 'MakeCore':
+    def __init__(self, given: Arguments, points: 'Points') -> None:
+        self._given = given
+        self._points = points
+        self.problem: str | None = None
+
+    def show(self, url: str) -> None:
+        """Print the address of the page, and open it if that is wanted."""
+        text = f'score as {self._given.name} at {url} (Ctrl-C ends it)'
+        browser.show(text, url, self._given.open)
+
+    def refuse(self, desk: 'Desk', problem: str) -> None:
+        """Show, here and on the page, that the run takes nothing of this scorer."""
+        self.problem = problem
+        desk.refuse(problem)
+        console(stderr=True).print(
+            f'codetr: nothing that {desk.scorer!r} states is taken: {problem}', style='bold red'
+        )
+
+    def wire(self, member: 'Membership', joined: 'Joined') -> 'Wiring':
+        """The wiring of the node."""
+        from codetr_ros.ros.wiring import Wiring
+
+        if member.outside:
+            self.refuse(cast('Desk', joined.core), member.outside)
+        return Wiring(member, joined)
+
+    def load(self) -> 'MakeCore':
+        """Import what is needed, and return what makes the core."""
+        from codetr_ros.cores.desks import unadmitted
         from codetr_ros.cores.scoring import Desk
-        from codetr_ros.nodes.errors import NodeError
         from codetr_ros.pages.scoring import ScoringPage
+
+        given, points, show = self._given, self._points, self.show
 
         class Served(Desk):
             """A desk with a page."""
@@ -135,22 +175,13 @@ def loading(
                     self._page.tick()
                     self._server.__exit__(None, None, None)
 
-        def make(run: 'RunSpec', settings: 'Settings', name: str, _: Any) -> 'Core[Any]':
-            if settings.scorer not in ('person', 'topic'):
-                raise NodeError(
-                    f'{name}: the scores of this run come from scorer = {settings.scorer!r}: '
-                    'start a run with --scorer person'
-                )
-            if settings.scorers and given.name not in settings.scorers:
-                raise NodeError(
-                    f'{name}: {given.name!r} is no scorer of this run, which takes the scores of '
-                    f'{", ".join(settings.scorers)}: give one of these names with --name'
-                )
-            return Served(run, settings)
+        def make(run: 'RunSpec', settings: 'Settings', *_: Any) -> 'Core[Any]':
+            desk = Served(run, settings)
+            if reason := unadmitted(given.name, settings):
+                self.refuse(desk, f'{reason}. --name gives the scorer another name')
+            return desk
 
         return make
-
-    return load
 
 
 class Drawing:
@@ -173,7 +204,7 @@ class Drawing:
         from codetr_ros.simulation.frames import write_request
         from codetr_ros.system.parsing import read_json
 
-        curves, actions = self._desk.curves(segment), self._desk.actions_before(segment)
+        curves, actions = self._desk.seen.curves(segment), self._desk.seen.actions_before(segment)
         if curves is None or actions is None:
             return None
         with self._lock, tempfile.TemporaryDirectory() as folder:

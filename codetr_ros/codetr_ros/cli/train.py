@@ -87,12 +87,12 @@ class Shown:
     Attributes:
         film: the robot in the report, if it can be drawn here.
         tensorboard: events for TensorBoard.
-        watch: a page in the browser.
+        offered: pages and services beside it.
     """
 
     film: bool = False
     tensorboard: bool = False
-    watch: bool = False
+    offered: beside.Offered = dataclasses.field(default_factory=beside.Offered)
 
 
 def main(arguments: Sequence[str], start: launcher.Start = launcher.start_program) -> int:
@@ -123,6 +123,15 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
             return refuse(
                 f'--scorer {settings.scorer} with --in-process: scores come over topics, which it '
                 'does without; leave out --in-process, or take --scorer simulated'
+            )
+        if extra['score_service'] and not settings.scored_elsewhere:
+            return refuse(
+                f'--score-service with --scorer {settings.scorer}: nobody else can score; add '
+                '--scorer topic'
+            )
+        if extra['score_service'] and in_process:
+            return refuse(
+                '--score-service with --in-process: services need nodes; leave out one of them'
             )
         tasks.check(settings, tasks.find(settings.task))
         if not in_process:
@@ -156,7 +165,10 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
         run_id, namespace = begun.run_id, begun.namespace
     topics = None if in_process else _topics(extra, namespace, start)
     command = shlex.join(['codetr', 'train', *arguments])
-    shown = Shown(extra['film'], extra['tensorboard'], extra['watch'])
+    offered = beside.Offered(
+        watch=extra['watch'], service=extra['score_service'], open=extra['open']
+    )
+    shown = Shown(extra['film'], extra['tensorboard'], offered)
     try:
         with held(folder, launcher.STOP_DEADLINE if begun else 0.0) as lock:
             if topics is not None and topics.start is launcher.start_program:
@@ -244,7 +256,7 @@ def train(
     if shown.tensorboard:
         events = Events(folder / run_folder.TENSORBOARD, settings, progress.log)
     key = {} if topics is None else topics.key
-    pages = beside.pages(folder, settings, progress.log, shown.watch, namespace, key)
+    pages = beside.pages(folder, settings, progress.log, shown.offered, namespace, key)
     middle = Middle(folder, settings, progress.log) if shown.film else None
     audience = Audience(summary, progress, live, events, pages, middle)
     with Interrupts() as interrupts, ExitStack() as open_pages:

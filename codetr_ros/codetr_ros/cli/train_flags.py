@@ -92,6 +92,22 @@ FLAGS: Sequence[tuple[str, Any, Any]] = [
         False,
     ),
     (
+        'open',
+        Annotated[bool, tyro.conf.arg(help='open the pages that are served in the browser here')],
+        False,
+    ),
+    (
+        'score_service',
+        Annotated[
+            bool,
+            tyro.conf.arg(
+                help='serve score_segment and wanted_segments, ROS services for programs that '
+                'score, to all who know the token that is printed'
+            ),
+        ],
+        False,
+    ),
+    (
         'bag',
         Annotated[
             bool,

@@ -10,8 +10,8 @@ from typing import Annotated
 
 import tyro
 
-from codetr_ros.cli import refuse
-from codetr_ros.cli.terminal import console, parse_arguments
+from codetr_ros.cli import browser, refuse
+from codetr_ros.cli.terminal import parse_arguments
 
 POLL = 0.25
 """Seconds between two looks at the folder."""
@@ -30,7 +30,8 @@ AllowedNames = Annotated[
     tuple[str, ...],
     tyro.conf.arg(metavar='NAME', help='further names of this machine by which browsers may ask'),
 ]
-"""Where a page in the browser is served: of every command that serves one."""
+Open = Annotated[bool, tyro.conf.arg(help='open the page in the browser, if there is one here')]
+"""Where a page is served, and whether it is opened: of every command that serves one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,6 +47,7 @@ class Arguments:
     host: Host = '127.0.0.1'
     port: Port = 0
     allow_name: AllowedNames = ()
+    open: Open = False
     video: Annotated[
         bool | None,
         tyro.conf.arg(
@@ -79,7 +81,8 @@ def main(arguments: Sequence[str]) -> int:
                     source, feed, given.host, given.port, given.allow_name, videos.place
                 ) as server,
             ):
-                console().print(f'watch {folder} at {server.url} (Ctrl-C ends it)')
+                text = f'watch {folder} at {server.url} (Ctrl-C ends it)'
+                browser.show(text, server.url, given.open)
                 while not interrupts.count:
                     source.poll()
                     wanted = not source.running if given.video is None else given.video

@@ -5,16 +5,16 @@ service, gives it judgements: `score` and `compare` may be called by any thread,
 once. What they refuse they refuse before anything is published.
 """
 
-import threading
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from codetr_ros.config import Settings
 from codetr_ros.cores.core import Part
+from codetr_ros.cores.seen import KINDS, Seen, Segment
 from codetr_ros.records import (
     OUTCOMES,
     Commit,
@@ -22,22 +22,13 @@ from codetr_ros.records import (
     Preference,
     Record,
     RunSpec,
-    ScoreRequest,
-    Transitions,
 )
-from codetr_ros.records.checks import check_run, check_score
+from codetr_ros.records.checks import check_score
 from codetr_ros.records.numbering import Judgement
 from codetr_ros.runs.reports import CoreReport
 
-Segment = tuple[str, int, int, int]
-"""Source, episode, first step, length."""
-
-MOST_STEPS = 100_000
-"""Steps whose observations and actions are held for the curves; the oldest episodes go first."""
 MOST_HISTORY = 200
 """Judgements that are shown; older ones can still be corrected by scoring the segment again."""
-NEWEST = 16
-"""Segments that are offered where nobody asks for any."""
 
 
 class ScoringError(ValueError):
@@ -49,6 +40,7 @@ class Given:
     """A judgement that was given here."""
 
     record: Judgement
+    after: int  # the phase that was committed last when it was given
     phase: int | None = None  # whose commit took it; None: none yet
 
     def document(self) -> dict[str, Any]:
@@ -66,15 +58,6 @@ class Given:
         return known | {'value': record.value}
 
 
-@dataclass
-class _Episode:
-    """The steps of an episode that have come."""
-
-    observations: list[Any] = field(default_factory=list)
-    actions: list[Any] = field(default_factory=list)
-    steps: int = 0
-
-
 class Desk(Part):
     """Offers segments to one scorer, and yields what it states of them.
 
@@ -82,31 +65,54 @@ class Desk(Part):
         run: the run.
         settings: its settings.
         scorer: the name of the scorer, which the run must admit.
+        seen: what is seen of the run, where several share it; None: seen by this desk alone.
+
+    Attributes:
+        problem: why the run would take nothing of what is stated here, so that nothing is
+            published; None: it may take it.
     """
 
-    subscribes: tuple[type, ...] = (Transitions, ScoreRequest, Commit)
+    subscribes: tuple[type, ...] = KINDS
 
-    def __init__(self, run: RunSpec, settings: Settings, scorer: str) -> None:
+    def __init__(
+        self, run: RunSpec, settings: Settings, scorer: str, seen: Seen | None = None
+    ) -> None:
         super().__init__()
         self._run = run
         self._settings = settings
         self.scorer = scorer
-        self._lock = threading.Lock()
-        self._episodes: OrderedDict[tuple[str, int], _Episode] = OrderedDict()
-        self._held = 0  # steps
-        self._cut: deque[Segment] = deque(maxlen=NEWEST)  # the newest, where nobody asks
-        self._asked: list[Segment] = []  # the most valuable first
-        self._request: int | None = None  # phase of the newest request
+        self.seen = Seen(run, settings) if seen is None else seen
+        self.problem: str | None = None
+        self._lock = self.seen.lock
         self._judged: dict[Segment, Given] = {}  # the newest score of each
         self._given: deque[Given] = deque(maxlen=MOST_HISTORY)
         self._outbox: deque[Judgement] = deque()
-        self._next = 0
+        self._next = self.taken + 1  # as this scorer did before it came back
         self._published = False
-        self.phase = -1  # the last that was committed
-        self.changes = 0
+        self._changes = 0
 
     # ------------------------------------------------------------------------------------------
     # the run
+
+    @property
+    def finished(self) -> bool:  # type: ignore[override]
+        """Whether the last phase is committed."""
+        return self.seen.finished
+
+    @property
+    def taken(self) -> int:
+        """Number of the last judgement of this scorer that a commit took; -1: none."""
+        return self.seen.taken.get(self.scorer, -1)
+
+    @property
+    def count(self) -> int:
+        """How many judgements this scorer has given: those with a number below that."""
+        return self._next
+
+    @property
+    def changes(self) -> int:
+        """How often what there is to show has changed."""
+        return self._changes + self.seen.changes
 
     def receive(self, record: Record) -> None:
         """Note a record.
@@ -114,58 +120,39 @@ class Desk(Part):
         Raises:
             RecordError: it is of another run; nothing has changed then.
         """
-        check_run(record, self._run)
+        self.seen.receive(record)
+        if isinstance(record, Commit):
+            self.note(record)
+
+    def refuse(self, problem: str) -> None:
+        """Take nothing from now on.
+
+        Args:
+            problem: why the run would take nothing of what is stated here, and what to do.
+        """
+        self.problem = problem
+        self._changes += 1
+
+    def note(self, commit: Commit) -> None:
+        """Note which judgements a commit took that has been seen."""
         with self._lock:
-            self.changes += 1
-            if isinstance(record, Transitions):
-                self._append(record)
-            elif isinstance(record, ScoreRequest):
-                self._ask(record)
-            elif isinstance(record, Commit):
-                self._commit(record)
-
-    def _append(self, chunk: Transitions) -> None:
-        episode = self._episodes.setdefault((chunk.source, chunk.episode), _Episode())
-        episode.observations.append(chunk.observations[:-1])
-        episode.actions.append(chunk.actions)
-        episode.steps += chunk.steps
-        self._held += chunk.steps
-        while self._held > MOST_STEPS and len(self._episodes) > 1:
-            self._held -= self._episodes.popitem(last=False)[1].steps
-        ended = chunk.terminated or chunk.truncated
-        after = chunk.first_step + chunk.steps
-        cut = self._settings.cuts.segments(
-            chunk.source, chunk.episode, chunk.first_step, after, ended
-        )
-        for first, length in cut:
-            self._cut.append((chunk.source, chunk.episode, first, length))
-
-    def _ask(self, request: ScoreRequest) -> None:
-        if self._request is not None and request.phase < self._request:
-            return
-        columns = (request.episodes, request.first_steps, request.lengths)
-        rows = [column.tolist() for column in columns]
-        self._request = request.phase
-        self._asked = list(zip(request.sources, *rows, strict=True))
-
-    def _commit(self, commit: Commit) -> None:
-        self.phase = max(self.phase, commit.phase)
-        last = dict(zip(commit.scorers, commit.scores.tolist(), strict=True)).get(self.scorer, -1)
-        if not self._published:
-            self._next = max(self._next, last + 1)  # as this scorer did before it came back
-        for given in self._given:
-            if given.phase is None and given.record.sequence <= last:
-                given.phase = commit.phase
-        if commit.phase >= self._settings.phases - 1:
-            self.finished = True
+            if not self._published:
+                self._next = max(self._next, self.taken + 1)
+            for given in self._given:
+                if given.phase is None and given.record.sequence <= self.taken:
+                    given.phase = commit.phase
 
     def work(self) -> Iterator[list[Record] | None]:
         """Yield judgements as soon as they are given."""
         while True:
-            with self._lock:
-                given = list(self._outbox)
-                self._outbox.clear()
-            yield given or None  # type: ignore[misc]
+            yield self.published() or None  # type: ignore[misc]
+
+    def published(self) -> list[Judgement]:
+        """The judgements that were given since this was called before."""
+        with self._lock:
+            given = list(self._outbox)
+            self._outbox.clear()
+            return given
 
     # ------------------------------------------------------------------------------------------
     # the person
@@ -175,36 +162,7 @@ class Desk(Part):
         first.
         """
         with self._lock:
-            return self._waiting()
-
-    def _waiting(self) -> list[Segment]:
-        asked = self._asked or list(reversed(self._cut))
-        held = [segment for segment in asked if self._whole(segment)]
-        return [segment for segment in held if segment not in self._judged]
-
-    def _whole(self, segment: Segment) -> bool:
-        source, episode, first, length = segment
-        known = self._episodes.get((source, episode))
-        return known is not None and known.steps >= first + length
-
-    def curves(self, segment: Segment) -> tuple[Any, Any] | None:
-        """Observations (m, O) and actions (m, A) of a segment; None if they are not held."""
-        source, episode, first, length = segment
-        with self._lock:
-            if not self._whole(segment):
-                return None
-            known = self._episodes[source, episode]
-            part = slice(first, first + length)
-            observations = np.concatenate(known.observations)[part]
-            return observations, np.concatenate(known.actions)[part]
-
-    def actions_before(self, segment: Segment) -> Any:
-        """The actions (n, A) of its episode up to a segment's end; None if they are not held."""
-        source, episode, first, length = segment
-        with self._lock:
-            if not self._whole(segment):
-                return None
-            return np.concatenate(self._episodes[source, episode].actions)[: first + length]
+            return [segment for segment in self.seen.offered() if segment not in self._judged]
 
     def score(self, segment: Segment, value: float) -> Given:
         """Score a segment, or correct its score; NaN: cannot tell.
@@ -263,13 +221,20 @@ class Desk(Part):
             return given
 
     def _require(self, segment: Segment) -> None:
+        if self.problem:
+            raise ScoringError(self.problem)
         if self.finished:
             raise ScoringError('the run has ended: nothing is learnt from what is stated now')
+        most = self._settings.judgements_ahead
+        if self._next - self.taken > most:
+            raise ScoringError(
+                f'{most} judgements of {self.scorer!r} wait for a commit, more are not taken: '
+                'wait until a phase is done'
+            )
         if segment in self._judged:
             return  # it was there once
         source, episode, first, length = segment
-        cut = self._settings.cuts.segments(source, episode, first, first + length, True)
-        if not self._whole(segment) or next(cut, None) != (first, length):
+        if not self.seen.holds(segment):
             raise ScoringError(
                 f'{source!r}, episode {episode}, steps {first} to {first + length - 1}: there is '
                 'no such segment (any more): judge one that is shown'
@@ -278,11 +243,18 @@ class Desk(Part):
     def _give(self, record: Judgement) -> Given:
         self._next += 1
         self._published = True
-        given = Given(record)
+        given = Given(record, self.seen.phase)
         self._given.append(given)
         self._outbox.append(record)
-        self.changes += 1
+        self._changes += 1
         return given
+
+    def _passed_over(self) -> int:
+        """Judgements that none of some later commits took: no other reason is left than that the
+        run refuses them, or that they were lost.
+        """
+        late = self.seen.phase - self._settings.ahead - 1
+        return sum(given.phase is None and given.after < late for given in self._given)
 
     def document(self) -> dict[str, Any]:
         """What there is to show: segments that wait, judgements given, and the last commit."""
@@ -290,11 +262,13 @@ class Desk(Part):
             return {
                 'scorer': self.scorer,
                 'task': self._settings.task,
-                'phase': self.phase,
+                'problem': self.problem,
+                'phase': self.seen.phase,
                 'phases': self._settings.phases,
                 'finished': self.finished,
-                'asked_after': self._request,
-                'waiting': [list(segment) for segment in self._waiting()],
+                'asked_after': self.seen.asked_after,
+                'passed_over': self._passed_over(),
+                'waiting': [list(segment) for segment in self.waiting()],
                 'given': [given.document() for given in list(self._given)[-20:]],
                 'count': self._next,
             }

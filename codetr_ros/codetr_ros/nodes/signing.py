@@ -18,6 +18,7 @@ from codetr_ros.nodes.errors import NodeError
 VARIABLE = 'CODETR_RUN_KEY'
 """The environment variable: 64 hexadecimal digits."""
 _KEY_BYTES = 32
+_TOKEN_BYTES = 8
 _PADDING = 4  # the middleware may append zeros up to a multiple of this
 
 
@@ -92,3 +93,22 @@ def is_signed(key: bytes, topic: str, data: bytes) -> bool:
         if hmac.compare_digest(signature(key, topic, data[:start]), data[start:end]):
             return True
     return False
+
+
+def is_keyed(data: bytes) -> bool:
+    """Whether whoever published a message has a key: it bears a signature at all."""
+    return any(data[-SIGNATURE_BYTES:])
+
+
+def token(key: bytes | None, namespace: str) -> str:
+    """What a caller of the services for scorers must name: it lets them score in one run, and is
+    no help in signing messages.
+
+    Args:
+        key: that of the run; None: the run has none, and the token is empty.
+        namespace: that of the run.
+    """
+    if key is None:
+        return ''
+    text = f'scores by service\0{namespace}'.encode()
+    return hashlib.blake2b(text, key=key, digest_size=_TOKEN_BYTES).hexdigest()

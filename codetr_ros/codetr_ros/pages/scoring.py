@@ -16,7 +16,8 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
-from codetr_ros.cores.scoring import Desk, ScoringError, Segment
+from codetr_ros.cores.scoring import Desk, ScoringError
+from codetr_ros.cores.seen import Segment
 from codetr_ros.pages.address import HERE, PageError
 from codetr_ros.pages.feed import Feed, plain
 from codetr_ros.pages.server import Server, page
@@ -126,10 +127,10 @@ class ScoringPage:
             return PlainTextResponse(str(error), 422)
         if sent.get('frames') is True:
             drawn = None
-            if self._frames is not None and self._desk.curves(segment) is not None:
+            if self._frames is not None and self._desk.seen.curves(segment) is not None:
                 drawn = await run_in_threadpool(self._frames, segment)
             return JSONResponse({'frames': drawn or []})
-        curves = self._desk.curves(segment)
+        curves = self._desk.seen.curves(segment)
         if curves is None:
             return PlainTextResponse('the steps of this segment are not held any more', 404)
         every = -(-segment[3] // MOST_POINTS)

@@ -12,6 +12,7 @@ from typing import Any
 from codetr_ros.config import IN_PROCESS_ONLY, Settings, from_canonical, settled
 from codetr_ros.cores.core import Core
 from codetr_ros.nodes.errors import NodeError
+from codetr_ros.nodes.signing import VARIABLE, is_keyed
 from codetr_ros.processes.openmp import threading_environment
 from codetr_ros.records import RunSpec
 from codetr_ros.records.roles import command
@@ -129,7 +130,10 @@ def own_run(member: Membership) -> tuple[RunSpec, Settings]:
 
 
 def join(
-    member: Membership, load_core: LoadCore, announce: Announce | None = None
+    member: Membership,
+    load_core: LoadCore,
+    announce: Announce | None = None,
+    looks_on: bool = False,
 ) -> Joined | None:
     """Join a run; None if asked to stop meanwhile.
 
@@ -137,6 +141,7 @@ def join(
         member: the node that joins.
         load_core: imports and returns what makes the core.
         announce: decides what run it is, in the learner; all others wait for its announcement.
+        looks_on: whether it may join a run that would take nothing of it (`Membership.outside`).
 
     Raises:
         NodeError: no run is announced, or one that this node cannot join.
@@ -154,6 +159,9 @@ def join(
         return None
     if settings is None:
         settings = _taken(member, run)
+        member.outside = _outside(member, run)
+        if member.outside and not looks_on:
+            raise NodeError(f'{link.full_name}: {member.outside}')
     parameters.declare_settings(node, settings)
     member.publish_presence()
     if announce is not None:
@@ -187,8 +195,30 @@ def _known(member: Membership) -> RunSpec | None:
     wanted = f'run {run_id!r}' if run_id else 'a run'
     topic = member.link.node.resolve_topic_name('run')
     remedy = f'start `{command("learner")}` in this namespace'
-    lacking = [f'the learner, which announces {wanted} on {topic!r} ({remedy})']
-    return member.run if wait_for(member, lambda: [] if member.run else lacking) else None
+
+    def lacking() -> list[str]:
+        if member.run:
+            return []
+        if member.link.key is not None and member.traffic.refused['run']:
+            return [
+                f'an announcement of {wanted} on {topic!r} that is signed with the key of this '
+                f'node: give it the {VARIABLE} of the run'
+            ]
+        return [f'the learner, which announces {wanted} on {topic!r} ({remedy})']
+
+    return member.run if wait_for(member, lacking) else None
+
+
+def _outside(member: Membership, run: RunSpec) -> str:
+    """Why nothing that this node publishes would be taken; empty if it would."""
+    if member.link.key is not None or not is_keyed(member.announcement):
+        return ''
+    return (
+        f'run {run.run_id!r} has a key and this process has none, so that nothing it publishes '
+        f'would be taken. Set {VARIABLE} before you start the run (export {VARIABLE}=$(openssl '
+        'rand -hex 32)), and to the same value where you start this process. The page that '
+        '`codetr train --scorer person` serves has the key of its run'
+    )
 
 
 def _taken(member: Membership, run: RunSpec) -> Settings:

@@ -65,6 +65,8 @@ class Membership:
         over: whether it has done everything, and publishes nothing more but its presence.
         doing: what the node does now, for people.
         waits_since: monotonic time [s] since which it has waited for that; None while it works.
+        outside: why nothing that the node publishes would be taken, so that it only looks on;
+            empty: it takes part.
         deadline_is: what the user sets `deadline` with, for errors.
         again: what the user does once the obstacle is gone, for errors.
 
@@ -103,6 +105,7 @@ class Membership:
         self.doing = 'starting'
         self.deadline_is, self.again = Limit.setting, Limit.again
         self.waits_since: float | None = None
+        self.outside = ''
         self._serves = False  # the core is made from the run's settings
         self._fetcher: Fetcher | None = None
         self._outbox: Outbox | None = None
@@ -199,6 +202,7 @@ class Membership:
 
     def publish(self, record: Record) -> None:
         """Publish a record of the node's core."""
+        assert not self.outside
         if self._outbox is not None:
             self._outbox.keep(record)
         self.link.publish(record)
@@ -351,6 +355,8 @@ class Membership:
         """Publish the node's presence, and the counts of its messages on /diagnostics."""
         finished = self.over
         self._presence_at = time.monotonic()
+        if self.outside:
+            return
         topics = tuple(t for t in published_by(self.role) if t in self.link.published)
         counters = self.traffic.counters()
         self.link.publish(

@@ -16,6 +16,7 @@ import signal
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 from codetr_ros.nodes import errors
@@ -260,6 +261,7 @@ def run_node(
     stop: Stop | None = None,
     wire: Wire = Wiring,
     kind: str | None = None,
+    looks_on: bool = False,
 ) -> int:
     """The main function of a node.
 
@@ -271,6 +273,7 @@ def run_node(
         stop: handlers of signals that are installed already; None: install them here.
         wire: another wiring (the recorder's, a robot's).
         kind: the name under which its own parameters are listed; None: that of its role.
+        looks_on: whether it may join a run that would take nothing of it (`Membership.outside`).
 
     Returns:
         Exit code: 0, also after SIGINT or SIGTERM unless other nodes had failed before; 1 after an
@@ -281,6 +284,7 @@ def run_node(
     def be_it(arguments: Sequence[str], stop: Stop) -> int:
         member = Membership(role, name, stop, arguments, kind)
         logging.getLogger('codetr_ros').addHandler(ToRos(member.log))
-        return Node(member, lambda it: joining.join(it, load_core, announce), wire).run()
+        join = partial(joining.join, load_core=load_core, announce=announce, looks_on=looks_on)
+        return Node(member, join, wire).run()
 
     return in_ros(name, argv, stop, be_it)

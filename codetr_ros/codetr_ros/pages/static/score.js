@@ -79,7 +79,7 @@ function render() {
   const wanted = state.comparing && !state.correcting ? 2 : 1;
   if (!kept || state.shown.length !== wanted) state.shown = due();
   const comparing = state.shown.length === 2;
-  const none = !state.shown.length || desk.finished;
+  const none = !state.shown.length || desk.finished || Boolean(desk.problem);
   at('answers').hidden = none || comparing;
   at('choices').hidden = none || !comparing;
   at('two').hidden = !comparing;
@@ -91,7 +91,17 @@ function render() {
     `${what}${state.shown.map(words).join(' | ')}. ${desk.waiting.length} wait. ${comparing ? '' : KEYS}`);
   if (!none) one.show(state.shown[0]).catch(refuse);
   if (comparing) two.show(state.shown[1]).catch(refuse);
+  renderProblems(desk);
   renderGiven();
+}
+
+function renderProblems(desk) {
+  at('problem').hidden = !desk.problem;
+  write(at('problem'), desk.problem ? `Nothing that you state is taken: ${desk.problem}` : '');
+  at('passed').hidden = !desk.passed_over;
+  write(at('passed'), desk.passed_over
+    ? `${desk.passed_over} of your statements were taken by none of the phases since. The run refuses them, or they were lost: the log of its recorder (logs/record.log) names the reason.`
+    : '');
 }
 
 function stated(given) {
