@@ -4,8 +4,10 @@ import sys
 
 import pytest
 
+from codetr_ros.cores.desks import Desks
 from codetr_ros.cores.people import SimulatedPeople
 from codetr_ros.cores.recorder import Recorder
+from codetr_ros.cores.scoring import Desk
 from codetr_ros.records import ROLES, TOPICS, Presence
 from codetr_ros.records.roles import (
     TABLE,
@@ -20,15 +22,15 @@ from codetr_ros.records.roles import (
 from helpers.builders import tiny
 
 FLOW = """
-run                learner                                sim evaluate reward score record
+run                learner                                sim evaluate reward score desk record
 task               sim                                    learner reward record
 policy             learner                                sim evaluate record
-transitions        sim                                    record reward learner score
-composite_rewards  sim score                              record reward
-preferences        score                                  record reward
-commits            record                                 reward learner score
+transitions        sim                                    record reward learner score desk
+composite_rewards  sim score desk                         record reward
+preferences        score desk                             record reward
+commits            record                                 reward learner score desk
 step_rewards       reward                                 learner record
-score_requests     reward                                 score record
+score_requests     reward                                 score desk record
 episodes           sim evaluate                           record
 true_rewards       sim                                    score record
 metrics            sim evaluate reward learner record     record
@@ -75,6 +77,12 @@ def test_the_recorder_reads_what_decides_when_a_phase_is_whole():
 
 def test_simulated_people_read_what_others_wait_for_them_to_read():
     assert set(SimulatedPeople.subscribes) == set(subscribed('score'))
+
+
+def test_a_desk_reads_what_is_said_that_it_reads_and_no_true_rewards():
+    for core in (Desk, Desks):
+        assert set(core.subscribes) == set(subscribed('desk'))
+    assert not {'true_rewards', 'episodes'} & {TOPICS[kind] for kind in read_by('desk')}
 
 
 def test_a_node_relies_only_on_roles_that_publish_what_it_reads():

@@ -100,13 +100,14 @@ class Offered:
 
     Attributes:
         watch: a page that shows it.
-        score: a page for a person who scores, though the run asks for none.
+        score: the name of a person for whom there is a page to score on, though the run asks for
+            none; empty: nobody.
         service: the services for programs that score.
         open: whether the pages are opened in a browser.
     """
 
     watch: bool = False
-    score: bool = False
+    score: str = ''
     service: bool = False
     open: bool = False
 
@@ -138,7 +139,7 @@ def pages(
     environment = launcher.environment(settings) | dict(key)
     program = (*PROGRAM, 'score', namespace)
     if offered.score or settings.scorer == 'person':
-        name = settings.scorers[0] if settings.scorers else 'person'
+        name = offered.score or (settings.scorers[0] if settings.scorers else 'person')
         page = (*program, '--name', name, *opened)
         beside.append(Beside(folder, log, SCORE_LOG, page, environment))
     if offered.service:

@@ -9,6 +9,7 @@ HELP = """usage: codetr demo NAME [OPTIONS]
 A whole example in one command; it ends by itself.
 
 examples:
+  person     a simulated person teaches an arm; watch it, and score beside
   robot      a robot in real time learns from the scores of an inspection
 
 `codetr demo NAME --help` explains the options of an example.
@@ -21,7 +22,13 @@ def _robot(arguments: Sequence[str]) -> int:
     return demo_robot.main(arguments)
 
 
-DEMOS: dict[str, Callable[[Sequence[str]], int]] = {'robot': _robot}
+def _person(arguments: Sequence[str]) -> int:
+    from codetr_ros.cli import demo_person
+
+    return demo_person.main(arguments)
+
+
+DEMOS: dict[str, Callable[[Sequence[str]], int]] = {'person': _person, 'robot': _robot}
 
 
 def main(arguments: Sequence[str]) -> int:

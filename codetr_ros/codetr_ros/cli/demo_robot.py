@@ -4,9 +4,7 @@ that an inspection gives late and not always.
 
 import dataclasses
 import os
-import secrets
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
@@ -14,7 +12,7 @@ from typing import Annotated
 import tyro
 
 from codetr_ros import config
-from codetr_ros.cli import FAILED, refuse
+from codetr_ros.cli import FAILED, demo_run, refuse
 from codetr_ros.cli.terminal import console, parse_arguments
 from codetr_ros.config import Settings, SettingsError
 from codetr_ros.processes import launcher
@@ -58,19 +56,14 @@ def main(arguments: Sequence[str]) -> int:
             f'the stand-in robot is not in {example or EXAMPLE}: start from the folder of the '
             'repository, or give --example FOLDER'
         )
-    stamp = time.strftime('%Y%m%d-%H%M%S')
     try:
         changes: dict[str, int] = {'seed': given.seed}
         if given.steps is not None:
             changes['steps'] = given.steps
-        settings = config.settled(config.load(str(example / 'settings.yaml')).changed(changes))
-        for role in settings.roles:
-            launcher.executable(role)
-        out = Path(given.out or f'runs/robot-{given.seed}-{stamp}')
-        folder = run_folder.create(out) if given.out else run_folder.create_next(out)
+        settings = config.load(str(example / 'settings.yaml')).changed(changes)
+        settings, run_id, folder = demo_run.begin('robot', settings, given.out)
     except (SettingsError, RunFolderError, LaunchError) as error:
         return refuse(str(error))
-    run_id = f'r{stamp.replace("-", "_")}_{secrets.token_hex(2)}'
     return _run(settings, run_id, folder, example)
 
 

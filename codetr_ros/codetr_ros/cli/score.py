@@ -101,10 +101,10 @@ def main(arguments: Sequence[str]) -> int:
     ros = ['--ros-args', '-r', f'__ns:={given.namespace}', '-p']
     argv = [*ros, f'peer_deadline:={given.peer_deadline}']
     if given.service:
-        return run_node('score', SERVICE_NODE, score.load_services, argv, wire=score.wire)
+        return run_node('desk', SERVICE_NODE, score.load_services, argv, wire=score.wire)
     page = Page(given, points)
     node = 'score_' + given.name.replace('-', '_')
-    code = run_node('score', node, page.load, argv, wire=page.wire, looks_on=True)
+    code = run_node('desk', node, page.load, argv, wire=page.wire, looks_on=True)
     return code or (FAILED if page.problem else 0)
 
 

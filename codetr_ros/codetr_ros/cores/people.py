@@ -106,9 +106,20 @@ class SimulatedPeople(Part):
             if not any(other == key for other, _ in self._held):
                 del self._rewards[key]
 
+    def find_scales(self) -> None:
+        """Find out what is poor and what is perfect, if that is not known: takes seconds. Over
+        topics it is done before the run begins, which waits for nobody later.
+
+        Raises:
+            TaskError: the task is unknown or cannot be used.
+            SettingsError: a perfect segment is no better than those of the random policy.
+        """
+        if not self._scales:
+            self._scales = scales(self._settings)
+
     def work(self) -> Iterator[list[Record] | None]:
         """Yield judgements when they are due."""
-        self._scales = scales(self._settings)
+        self.find_scales()
         yield []
         while True:
             while self._requests:

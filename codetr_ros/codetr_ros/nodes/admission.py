@@ -30,7 +30,7 @@ from codetr_ros.records.roles import WRITERS
 from codetr_ros.records.shown import shown
 from codetr_ros.system.liveness import has_ended
 
-MANY = ('sim', 'score')
+MANY = ('sim', 'score', 'desk')
 """Roles of which a run may have several nodes, each under a name of its own."""
 SCORER = 'scorer'
 MOST_MEMBERS = 1000

@@ -106,8 +106,15 @@ TABLE: dict[str, Role] = {
         publishes=(CompositeReward, Preference),
         reads=(RunSpec, Transitions, TrueRewards, ScoreRequest, Commit),
         relies_on=('sim', 'record'),
-        # nobody waits for a person, who may come and go
         count=lambda settings: int(settings.scorer == 'simulated'),
+    ),
+    'desk': Role(
+        'codetr_ros', 'score',
+        publishes=(CompositeReward, Preference),
+        reads=(RunSpec, Transitions, ScoreRequest, Commit),
+        relies_on=('sim', 'record'),
+        # nobody waits for a person or a program that scores: they come and go
+        count=lambda settings: 0,
     ),
     'record': Role(
         'codetr_ros', 'record',

@@ -24,7 +24,9 @@ def load() -> 'MakeCore':
 
     def make(run: 'RunSpec', settings: 'Settings', name: str, folder: Any) -> 'Core[Any]':
         if settings.scorer == 'simulated':
-            return SimulatedPeople(run, settings)
+            people = SimulatedPeople(run, settings)
+            people.find_scales()
+            return people
         return serve(run, settings, name, folder)
 
     return make
