@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from codetr_ros import config
+from codetr_ros.offline.score_course import ScoreCourse
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import report, summary
 from codetr_ros.runs.report_text import recovery_text, scale_text
-from codetr_ros.runs.run_summary import RewardRecovery, RunSummary
+from codetr_ros.runs.run_summary import GivenScores, RewardRecovery, RunSummary
 from codetr_ros.runs.segments import Segment
 from codetr_ros.runs.summary import Summary
 from helpers.summaries import SETTINGS, a_run, episode, run_summary
@@ -228,3 +229,28 @@ def test_the_report_tells_the_last_reward_recovery(rows, shown):
 def test_the_sketch_of_a_curve_fits_the_terminal(encoding: str | None, shown: str) -> None:
     assert report.sketch([0, 50, 110, 0], encoding) == shown
     assert report.sketch([3.0, 3.0], 'utf-8') == '▁▁'
+
+
+def test_a_run_that_nobody_evaluates_states_so_once_and_shows_the_scores_that_were_given(tmp_path):
+    given = [GivenScores(phase=n, scores=2 + n, per_step=0.1 * n, random=n < 2) for n in range(10)]
+    names = ('random', 'final_score', 'random_score', 'final_true_return', 'random_true_return')
+    changes = dict.fromkeys(names) | {'evaluations': [], 'scores_given': given}
+    made = run_summary().model_copy(update=changes)
+    page = written(tmp_path, made)
+    assert page.count('not evaluated') == 0
+    assert page.count('no policy was tried in simulation') == 1
+    assert 'Evaluations' not in headings(page)
+    # phases 8 and 9: (10 * 0.8 + 11 * 0.9) / 21
+    assert 'last fifth of the phases' in page and '0.852, mean of 21 scores' in page
+    assert '0.060, mean of 5 scores' in page
+    drawn = report.given(given, report.title(made))
+    assert (tmp_path / run_folder.PICTURE).read_bytes() == drawn
+
+
+def test_the_scores_of_a_bag_are_given_to_the_summary_by_phase():
+    course = ScoreCourse({0: [1.0, 3.0], 4: [2.0]})
+    rows = course.rows(warmup=1)
+    assert [(r.phase, r.scores, r.per_step, r.random) for r in rows] == [
+        (0, 2, 2.0, True),
+        (4, 1, 2.0, False),
+    ]

@@ -48,6 +48,7 @@ def complete(
     from codetr_ros.bags.dropped import undropped_entries
     from codetr_ros.bags.errors import BagError, Damage
     from codetr_ros.bags.reader import Bag
+    from codetr_ros.offline.score_course import score_course
 
     faults: dict[Damage, None] = {}
     try:
@@ -62,6 +63,8 @@ def complete(
                 record: Record = entry.record
                 if record.run_id == summary.run_id:
                     summary.receive(record)
+        if summary.settings.scored_elsewhere:
+            summary.scores_given = score_course(bag).rows(summary.settings.warmup_phases)
     except BagError as error:
         log(f'the summary holds what was received, and the bag up to a fault: {error}')
     except RecoveryError as error:

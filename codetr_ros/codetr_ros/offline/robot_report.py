@@ -2,31 +2,14 @@
 
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 from codetr_ros.offline.score_course import ScoreCourse
-from codetr_ros.runs import pictures
+from codetr_ros.runs import report
 from codetr_ros.runs.document import Block, Facts, Heading, Links, Paragraph, Picture, page
 from codetr_ros.runs.reports import NodeReport
 from codetr_ros.system.parsing import parse_json
 
 PAGE = 'robot.html'
-
-
-def picture(course: ScoreCourse, warmup: int) -> bytes:
-    """The scores by phase, those of the random policy apart."""
-    means = [(phase + 1.0, course.mean(phase, phase + 1)[0]) for phase in sorted(course.by_phase)]
-
-    def draw(figure: Any) -> None:
-        axes = figure.subplots()
-        pictures.line(axes, means[: warmup + 1], 'random policy', pictures.GREY)
-        pictures.line(axes, means[warmup:], 'learnt policy', pictures.INFERRED)
-        axes.set_xlabel('phase')
-        axes.set_ylabel('mean score per step')
-        axes.legend(frameon=False)
-        pictures.plain(axes)
-
-    return pictures.png((pictures.WIDE, 3.4), draw)
 
 
 def faults(log: Path) -> dict[str, int]:
@@ -58,7 +41,7 @@ def robot_page(
     blocks: list[Block] = [
         Heading(title, 1),
         Facts(list(outcome.items())),
-        Picture(picture(course, warmup), 'mean score per step, by phase'),
+        Picture(report.given(course.rows(warmup)), 'mean score per step, by phase'),
         Heading('Control'),
     ]
     counters = robot.counters if robot else {}

@@ -10,6 +10,7 @@ import numpy as np
 from codetr_ros.bags.dropped import undropped_entries
 from codetr_ros.bags.reader import Bag
 from codetr_ros.records import CompositeReward, Transitions
+from codetr_ros.runs.run_summary import GivenScores
 
 
 @dataclass
@@ -28,6 +29,19 @@ class ScoreCourse:
             return float('nan'), float('nan'), 0
         error = np.std(values, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
         return float(np.mean(values)), float(error), len(values)
+
+    def rows(self, warmup: int) -> list[GivenScores]:
+        """The scores by phase, for a summary.
+
+        Args:
+            warmup: phases of the random policy.
+        """
+        return [
+            GivenScores(
+                phase=n, scores=len(values), per_step=float(np.mean(values)), random=n < warmup
+            )
+            for n, values in sorted(self.by_phase.items())
+        ]
 
     def to_csv(self) -> str:
         """A line for each phase, as text."""

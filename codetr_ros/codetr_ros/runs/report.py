@@ -31,13 +31,17 @@ from codetr_ros.runs.report_text import (
     sketch,
     title,
 )
-from codetr_ros.runs.run_summary import RunSummary
+from codetr_ros.runs.run_summary import GivenScores, RunSummary
 from codetr_ros.runs.segments import Segment
 from codetr_ros.system.files import atomic_write
 
 __all__ = ['Material', 'draw', 'page', 'result_rows', 'sketch', 'title', 'write']
 
 _SCORE = '#b8561c'
+_SCORE_IS = (
+    'The score is the composite return of an episode over that of an agent that earns the '
+    "task's largest reward at every step."
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,9 +70,12 @@ def draw(summary: RunSummary) -> bytes:
 
     It begins at step 0 with the random policy, which the dashed lines repeat. The bands show the
     spread over an evaluation's episodes: worst to best for the true return, one standard deviation
-    for the score.
+    for the score. Where nothing was evaluated, and others than the simulator scored, their scores
+    by phase.
     """
     rows = summary.evaluated()
+    if not rows and summary.scores_given:
+        return given(summary.scores_given, title(summary))
     steps = [row.step for row in rows]
 
     def numbers(name: str) -> list[float]:
@@ -118,6 +125,27 @@ def draw(summary: RunSummary) -> bytes:
     return pictures.png((pictures.WIDE, 4.8), both)
 
 
+def given(rows: Sequence[GivenScores], heading: str | None = None) -> bytes:
+    """The scores that others than the simulator gave, by phase, as a PNG."""
+
+    def points(of: Sequence[GivenScores]) -> list[tuple[float, float]]:
+        return [(row.phase + 1.0, row.per_step) for row in of]
+
+    def one(figure: Any) -> None:
+        if heading:
+            figure.suptitle(heading, fontsize=10)
+        axes = figure.subplots()
+        begin = sum(row.random for row in rows)
+        pictures.line(axes, points(rows[: begin + 1]), 'random policy', pictures.GREY)
+        pictures.line(axes, points(rows[begin:]), 'learnt policy', pictures.INFERRED)
+        axes.set_xlabel('phase')
+        axes.set_ylabel('mean score given per step')
+        axes.legend(frameon=False)
+        pictures.plain(axes)
+
+    return pictures.png((pictures.WIDE, 3.4), one)
+
+
 def page(summary: RunSummary, picture: bytes, material: Material | None = None) -> str:
     """The HTML page, with everything in it.
 
@@ -126,7 +154,7 @@ def page(summary: RunSummary, picture: bytes, material: Material | None = None) 
         picture: the learning curve.
         material: what else to show; None: nothing.
     """
-    given = material or Material()
+    shown = material or Material()
     blocks: list[Block] = [
         Heading(title(summary), 1),
         *([Paragraph(summary.failure, bad=True)] if summary.failure else []),
@@ -134,18 +162,14 @@ def page(summary: RunSummary, picture: bytes, material: Material | None = None) 
         Picture(picture, 'learning curve'),
         Heading('Result'),
         facts(result_rows(summary)),
-        Paragraph(
-            'The score is the composite return of an episode over that of an agent that earns the '
-            "task's largest reward at every step."
-        ),
-        *_film(given),
-        Heading('Evaluations'),
-        _evaluations(summary),
+        *([Paragraph(_SCORE_IS)] if summary.evaluated() else []),
+        *_film(shown),
+        *([Heading('Evaluations'), _evaluations(summary)] if summary.evaluated() else []),
         *scorers.blocks(summary),
-        *_recovery(summary, given.segments),
-        *_training(summary, given.columns),
-        *origin(summary, given.files),
-        *(Paragraph(note, bad=True) for note in given.notes),
+        *_recovery(summary, shown.segments),
+        *_training(summary, shown.columns),
+        *origin(summary, shown.files),
+        *(Paragraph(note, bad=True) for note in shown.notes),
         *details(summary),
     ]
     return document.page(blocks)
@@ -163,8 +187,6 @@ def _film(given: Material) -> Iterator[Block]:
 
 def _evaluations(summary: RunSummary) -> Block:
     rows = summary.evaluated()
-    if not rows:
-        return Paragraph('None.')
     returns = [
         *(row.true_return_mean for row in rows),
         *(row.true_return_std for row in rows),

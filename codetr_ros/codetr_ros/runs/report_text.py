@@ -5,7 +5,9 @@ from collections.abc import Sequence
 from codetr_ros.config import delay_in_words
 from codetr_ros.runs import references
 from codetr_ros.runs.numbers import exact, number, returns
-from codetr_ros.runs.run_summary import RewardRecovery, RunSummary
+from codetr_ros.runs.run_summary import GivenScores, RewardRecovery, RunSummary
+
+NOT_EVALUATED = 'none: no policy was tried in simulation'
 
 
 def inexact(summary: RunSummary) -> str:
@@ -39,13 +41,17 @@ def result_rows(summary: RunSummary) -> list[tuple[str, str]]:
     final, spread = returns(summary.final_true_return, std)
     (random,) = returns(summary.random_true_return)
     after = f' after {last.step} steps' if last else ''
-    return [
+    evaluated = [
         ('score', f'{score(summary.final_score)}{after}'),
         ('score of the random policy', score(summary.random_score)),
         ('true return', (final or 'not evaluated') + (f' +- {spread}' if spread else '')),
         ('true return of the random policy', random or 'not evaluated'),
         *((f'... {name}', value) for name, value in _recorded(summary)),
         ('reward recovery', _recovery(summary)),
+    ]
+    return [
+        *(evaluated if summary.evaluated() else [('evaluation', NOT_EVALUATED)]),
+        *_given(summary.scores_given),
         ('steps', f'{summary.steps} of {summary.steps_planned}'),
         ('phases', f'{summary.phases} of {summary.phases_planned}'),
         ('time', f'{summary.wall_s:.1f} s, {summary.steps_per_s or 0:.0f} steps per second'),
@@ -56,6 +62,18 @@ def result_rows(summary: RunSummary) -> list[tuple[str, str]]:
         ),
         *_left_out(summary),
     ]
+
+
+def _given(rows: Sequence[GivenScores]) -> list[tuple[str, str]]:
+    """The scores that others than the simulator gave, at the begin and at the end."""
+    random = [row for row in rows if row.random]
+    learnt = [row for row in rows if not row.random][-max(1, len(rows) // 5) :]
+    shown = []
+    for name, part in (('random policy', random), ('last fifth of the phases', learnt)):
+        if count := sum(row.scores for row in part):
+            mean = sum(row.scores * row.per_step for row in part) / count
+            shown.append((f'score given per step, {name}', f'{mean:.3f}, mean of {count} scores'))
+    return shown
 
 
 def _left_out(summary: RunSummary) -> list[tuple[str, str]]:

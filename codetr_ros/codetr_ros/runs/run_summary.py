@@ -89,6 +89,15 @@ class ScorerRow(Facts):
     )
 
 
+class GivenScores(Facts):
+    """The scores of the segments that began in a phase, where others than the simulator scored."""
+
+    phase: int = Field(description='the phase')
+    scores: int = Field(description='how many there are')
+    per_step: float = Field(description='their mean, each divided by the steps of its segment')
+    random: bool = Field(description='whether the random policy acted in it')
+
+
 class ProcessUse(Facts):
     """The resources that a process used, and how it ended; null if not known."""
 
@@ -168,6 +177,9 @@ class RunSummary(Facts):
     )
     scorers: dict[str, ScorerRow] = Field(
         {}, description='who scored, by name, where others than the simulator did'
+    )
+    scores_given: list[GivenScores] = Field(
+        [], description='the scores by phase, where others than the simulator scored'
     )
     bag: str | None = Field(description="folder of the run's bag; null without one")
     processes: dict[str, ProcessUse] = Field(

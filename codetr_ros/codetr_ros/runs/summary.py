@@ -24,7 +24,7 @@ from codetr_ros.runs import run_summary, scorers, segments
 from codetr_ros.runs.leavers import Leavers
 from codetr_ros.runs.recovery import Recovery
 from codetr_ros.runs.reports import NodeReport
-from codetr_ros.runs.run_summary import Evaluation, RewardRecovery, RunSummary
+from codetr_ros.runs.run_summary import Evaluation, GivenScores, RewardRecovery, RunSummary
 from codetr_ros.runs.segments import Segment
 from codetr_ros.runs.tallies import count_messages, processes
 from codetr_ros.system import modules
@@ -112,6 +112,7 @@ class Summary:
         self._before = 0  # steps of the run before its time began
         self._recovery = Recovery(settings, not in_process if recorded is None else recorded)
         self._leavers = Leavers()
+        self.scores_given: list[GivenScores] = []  # from the bag
         self._wall: float | None = None  # seconds that the run took, once it is over
 
     def receive(self, record: Record) -> None:
@@ -279,6 +280,7 @@ class Summary:
                 for (role, _, name), value in values.items()
                 if role == 'reward'
             ),
+            scores_given=self.scores_given,
             # where it is now: the folder may have been moved since the recorder wrote it
             bag=str(bag) if bag else _first(r.bag for r in of_role('record')),
             processes=processes(reports),
