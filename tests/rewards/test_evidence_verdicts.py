@@ -15,7 +15,7 @@ from codetr_ros.rewards.evidence import links, saving
 from codetr_ros.rewards.evidence.method import Evidence
 from codetr_ros.rewards.evidence.model import Model, Targets
 from codetr_ros.rewards.evidence.sample import Sample
-from codetr_ros.rewards.evidence.verdicts import Verdicts
+from codetr_ros.rewards.evidence.verdicts import LAPSES, Verdicts
 from codetr_ros.simulation.composite import composite
 from helpers import builders, planted
 from helpers.builders import ACTION as A
@@ -31,7 +31,8 @@ def moments(verdict: int, mean: float, variance: float) -> tuple[float, float, f
 
     def density(level: float) -> float:
         below, above = norm.cdf((edges[verdict : verdict + 2] - level) / SCALE.tau)
-        return float(norm.pdf(level, mean, variance**0.5) * (above - below))
+        likely = (1 - LAPSES) * (above - below) + LAPSES / 4
+        return float(norm.pdf(level, mean, variance**0.5) * likely)
 
     far = 9 * variance**0.5
     mass, first, second = (
@@ -52,6 +53,12 @@ def test_what_a_verdict_states_of_a_level_is_what_integration_finds(verdict, mea
     assert SCALE.log_likelihood(scores, at, over) == pytest.approx(np.log(mass), rel=1e-6)
 
 
+def test_a_verdict_that_is_surely_a_lapse_states_nothing_of_a_level():
+    scores, far, sure = SCALE.values[[0]], np.array([9.0]), np.array([0.1])
+    assert_allclose(SCALE.expected(scores, far, sure), [far, sure], rtol=1e-9)
+    assert SCALE.sites(scores, far, sure)[1] > 1e5 * sure
+
+
 def test_a_site_times_what_was_expected_before_is_what_is_expected_after():
     scores, rng = SCALE.values[[0, 1, 2, 3]], np.random.default_rng(0)
     mean, variance = rng.normal(size=4), rng.uniform(0.2, 2, 4)
@@ -68,13 +75,27 @@ def test_verdicts_far_from_what_was_expected_stay_finite():
         assert np.isfinite(expected).all()
 
 
-def test_thresholds_and_noise_are_found_again():
+@pytest.mark.parametrize(('mean', 'variance'), [(0.0, 1.0), (1.4, 0.05), (-6.0, 0.5)])
+def test_what_verdicts_are_expected_to_reveal_is_what_integration_finds(mean, variance):
+    found = [moments(verdict, mean, variance) for verdict in range(4)]
+    left = sum(mass * after for mass, _, after in found)
+    share = SCALE.revealed(np.array([mean]), np.array([variance]))
+    assert share[0] == pytest.approx(1 - left / variance, abs=1e-5)
+
+
+def test_a_verdict_that_can_be_foreseen_reveals_nothing():
+    open_, foreseen = SCALE.revealed(np.array([0.2, -9.0]), np.array([1.0, 1.0]))
+    assert open_ > 0.4 and foreseen < 0.01
+
+
+def test_thresholds_and_noise_are_found_again_among_lapses():
     rng = np.random.default_rng(1)
     levels = rng.normal(size=6000)
     noisy = levels + 0.4 * rng.normal(size=6000)
     scores = SCALE.values[np.searchsorted(SCALE.thresholds, noisy)]
-    first = Verdicts.first(scores, levels)
-    found = first.learnt(scores, levels, np.full(6000, 1e-6))
+    lapsed = rng.random(6000) < LAPSES
+    scores[lapsed] = SCALE.values[rng.integers(0, 4, lapsed.sum())]
+    found = Verdicts.first(scores, levels).learnt(scores, levels, np.full(6000, 1e-6))
     assert_allclose(found.thresholds, SCALE.thresholds, atol=0.05)
     assert found.tau == pytest.approx(SCALE.tau, rel=0.1)
 
@@ -84,6 +105,7 @@ def test_mean_verdicts_are_those_of_the_probabilities():
     edges = np.concatenate([[-np.inf], SCALE.thresholds, [np.inf]])
     total = (SCALE.spread + SCALE.tau**2) ** 0.5
     shares = np.diff(norm.cdf((edges - level[:, None]) / total), axis=1)
+    shares = (1 - LAPSES) * shares + LAPSES / 4
     assert_allclose(SCALE.mean_value(level), shares @ SCALE.values, rtol=1e-12)
 
 

@@ -167,6 +167,24 @@ def test_evidence_labels_steps_without_a_score_by_the_regression_alone(composite
     assert np.corrcoef(found, true)[0, 1] > (0.9 if composite == 'sum' else 0.6)
 
 
+def test_evidence_is_the_more_cautious_where_there_is_no_score_the_less_it_knows_of_a_step():
+    memory, missing = half_scored(60)
+    bold, cautious = (
+        trained('evidence', memory, evidence__caution=caution) for caution in (0.0, 2.0)
+    )
+    batch = memory.segments.batch(memory.segments.all_ids())
+    inside = segment_steps(batch)
+    unscored = inside & missing[:, None]
+    far = np.linalg.norm(batch.observations[:, :-1][unscored], axis=-1)
+    less = bold.label(batch) - cautious.label(batch)
+    assert not less[inside & ~missing[:, None]].any(), 'a score is explained exactly'
+    usual = bold.metrics()['step_sd']
+    doubt = bold.uncertainty(batch).steps[unscored]
+    np.testing.assert_allclose(less[unscored], 2 * (doubt - usual), atol=1e-6)  # float32
+    less, common = less[unscored], np.median(far)
+    assert less[far > 1.5 * common].mean() > less[far < common].mean(), 'rare steps are known less'
+
+
 def test_rules_refuse_a_memory_in_which_nothing_is_scored():
     memory = irregular(6)
     made = trained('uniform', memory)

@@ -161,3 +161,16 @@ def test_a_score_is_not_mistaken_for_a_preference():
     memory.settle()
     assert len(memory.judgements.pairs()) == 0
     assert memory.segments.scores(memory.segments.ids()).tolist() == [3.0]
+
+
+@pytest.mark.parametrize('stars', [True, False], ids=['few different scores', 'numbers'])
+def test_scores_of_a_person_are_verdicts_where_few_of_them_differ(stars):
+    memory, rewards, worth = planted(0)
+    values = np.digitize(worth, np.quantile(worth, [0.5, 0.8, 0.9])) + 1.0 if stars else worth
+    for n, value in enumerate(values.tolist()):
+        memory.judge(builders.score(scorer='me', first_step=DELAY * n, length=DELAY, value=value))
+    memory.settle()
+    made = trained(memory, method='evidence', composite='sum')
+    assert ('thresholds' in made.report()) == stars
+    labels = np.concatenate(list(made.label_passes(memory, memory.segments.all_ids())))
+    assert np.corrcoef(labels, rewards)[0, 1] > 0.9

@@ -289,7 +289,15 @@ class EvidenceSettings(Group):
         'auto',
         description='whether scores are numbers, or verdicts such as one to five stars of which '
         'only the order means anything: their scale is then learnt too; auto: ordinal where '
-        '`score_levels` are set',
+        '`score_levels` are set, and where others than the simulator give few different scores',
+    )
+    caution: float = Field(
+        1.0,
+        ge=0,
+        le=100,
+        description='steps of segments without a score: how many standard deviations a reward '
+        'lies below what is expected, as far as less is known of it than of the newest steps with '
+        'a score',
     )
     scores: int = Field(
         8192,

@@ -4,8 +4,9 @@ Where the reward method knows how far the level of a score may be off, the segme
 knows least comes first, then the one of which it knows least once the first is scored, and so on:
 the variance of a level falls by what the chosen ones will reveal of it (greedy selection, as in
 Krause and Singh, 2008, for Gaussian processes). So segments that are alike are not asked for
-together. Elsewhere segments are drawn among the newest. Only the newest ones are looked at in
-either case: they are what the present policy does. The choice of candidates is decided here.
+together, and none whose verdict can be foreseen. Elsewhere segments are drawn among the newest.
+Only the newest ones are looked at in either case: they are what the present policy does. The
+choice of candidates is decided here.
 """
 
 import numpy as np

@@ -41,7 +41,9 @@ from codetr_ros.rewards.evidence.uncertainty import (
     Uncertainty,
     deviations,
     level_covariance,
+    step_deviations,
 )
+from codetr_ros.rewards.evidence.verdicts import are_verdicts, require_few_values
 from codetr_ros.seeding import generator
 from codetr_ros.system.states import check_state
 
@@ -87,8 +89,9 @@ class Evidence(Predictor):
 
     @property
     def _ordinal(self) -> bool:
-        asked = self._own.score_scale
-        return asked == 'ordinal' or (asked == 'auto' and self._settings.score_levels > 0)
+        asked, settings = self._own.score_scale, self._settings
+        given = settings.score_levels > 0 or settings.scored_elsewhere
+        return asked == 'ordinal' or (asked == 'auto' and given)
 
     @property
     def version(self) -> int:
@@ -119,10 +122,10 @@ class Evidence(Predictor):
         anew = len(all_ids) >= 2 * self._begun_at
         choosing = anew and self._own.link == 'choose'
         ordinal = self._ordinal
-        if ordinal and memory.judgements is not None:  # one value so far, or scales of several
-            ordinal = 2 <= len(np.unique(scores)) <= saving.MOST_VALUES
+        if ordinal and memory.judgements is not None:
+            ordinal = are_verdicts(scores, self._own.score_scale == 'ordinal')
         elif ordinal:
-            saving.require_few_values(scores)
+            require_few_values(scores)
         steps = choosing or not all(model.link.linear for _, model in self._mixture)
         ids = self._ids(memory, all_ids, steps)
         moments = self._sampler.moments(memory, ids)
@@ -234,6 +237,9 @@ class Evidence(Predictor):
     def label(self, batch: SegmentBatch) -> F32:
         """Step rewards (B, L) that explain each segment's score, 0 elsewhere.
 
+        Where there is no score to explain, what is not known is not worth trying out: a step's
+        reward is the lower, the less is known of it (`evidence.caution`).
+
         Raises:
             RewardModelError: `prepare` was never called.
         """
@@ -246,7 +252,16 @@ class Evidence(Predictor):
             * (share * model.scale / self.unit)
             for share, model in self._mixture
         )
+        unscored = inside & np.isnan(batch.values)[:, None]
+        if self._own.caution and unscored.any():
+            labels[unscored] -= self._own.caution * self._doubt_beyond_usual(batch, unscored)
         return labels
+
+    def _doubt_beyond_usual(self, batch: SegmentBatch, steps: NDArray[np.bool_]) -> F64:
+        """How much less sure (N,) the likelier link is of steps than of the newest scored ones."""
+        features = (self._features(piece) for piece in _steps(batch, steps))
+        found = step_deviations(self._model, features) * (self._model.scale / self.unit)
+        return found - self._step_sd
 
     def predict(self, batch: SegmentBatch) -> F64:
         """The composite rewards (B,) that the steps alone let expect, in the task's unit.
@@ -278,12 +293,21 @@ class Evidence(Predictor):
         return Uncertainty(steps, found.segments * factor)
 
     def doubt(self, batch: SegmentBatch) -> F64:
-        """Covariance (B, B) of the levels of segments' scores, of the likelier link's weights."""
+        """Covariance (B, B) of what scores would reveal of levels, of the likelier link's weights.
+
+        A number reveals its level. Of a verdict that can be foreseen nothing is learnt.
+        """
         self._require_prepared()
+        model, m = self._model, batch.lengths - batch.context
         features = [self._features(piece) for piece in _steps(batch, segment_steps(batch))]
-        factor = self._model.scale / self.unit
-        m = batch.lengths - batch.context
-        return level_covariance(self._model, features, m) * factor**2
+        factor = model.scale / self.unit
+        found = level_covariance(model, features, m) * factor**2
+        if model.verdicts is None:
+            return found
+        f = self._f(batch, model)
+        levels = model.link.forward(f, np.cumsum(m) - m, m)[0]
+        share = model.verdicts.revealed(levels, deviations(model, features, m).segments ** 2)
+        return found * np.sqrt(np.outer(share, share))
 
     def step_deviations(self, batch: SegmentBatch) -> F32:
         """How far each label (B, L) may be off, one standard deviation."""

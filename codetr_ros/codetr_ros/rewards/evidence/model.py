@@ -52,6 +52,8 @@ LEAST_LEFT = (1e-3, 0.2)
 for others. A few rounds of Gauss-Newton do not end where that would be exact, and without this and
 the next two bounds such fits diverge.
 """
+MOST_CHANGE = 4.0
+"""Of the unit of levels in a turn, as a factor: verdicts that show nothing have no spread."""
 FARTHEST, SUREST = 4.0, 0.05
 """Deviations of levels: how far from their mean a verdict's level may be, and the least deviation
 that it may have.
@@ -193,6 +195,7 @@ class Model:
                 expected = verdicts.expected(scores, mean, variance)[0]
                 several = len(verdicts.values) > 1
                 factor = float(levels.std() / (expected.std() or 1.0)) if several else 1.0
+                factor = min(max(factor, 1 / MOST_CHANGE), MOST_CHANGE)
                 shift = float(levels.mean() - factor * expected.mean())
                 verdicts = verdicts.moved(factor, shift)
                 mean, variance = mean * factor + shift, variance * factor**2

@@ -6,16 +6,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codetr_ros.records import F64
-from codetr_ros.rewards.base import RewardModelError
 from codetr_ros.rewards.evidence import links
 from codetr_ros.rewards.evidence.maxima import SoftMax
 from codetr_ros.rewards.evidence.model import Model
 from codetr_ros.rewards.evidence.regression import Posterior
-from codetr_ros.rewards.evidence.verdicts import Verdicts
-
-MOST_VALUES = 32
-"""Of an ordinal scale."""
+from codetr_ros.rewards.evidence.verdicts import MOST_VALUES, Verdicts
 
 
 def saved(model: Model) -> dict[str, Tensor]:
@@ -98,19 +93,3 @@ def restored(
     model.theta = np.array(state['theta'].numpy())
     model.posterior = Posterior(state['weights'].clone(), state['covariance'].clone())
     return model
-
-
-def require_few_values(scores: F64) -> None:
-    """Refuse scores that cannot be those of an ordinal scale.
-
-    Raises:
-        RewardModelError: they have one value only, or too many.
-    """
-    values = np.unique(scores)
-    if not 2 <= len(values) <= MOST_VALUES:
-        shown = ', '.join(f'{value:g}' for value in values[:3])
-        raise RewardModelError(
-            f'evidence.score_scale = ordinal: the {len(scores)} scores have {len(values)} '
-            f'different values ({shown}, ...), an ordinal scale has 2 to {MOST_VALUES}. Set '
-            'evidence.score_scale to numbers'
-        )

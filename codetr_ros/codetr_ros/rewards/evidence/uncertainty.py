@@ -3,6 +3,7 @@
 The formulas: docs/methods.md#evidence.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +34,18 @@ class Deviations:
     segments: F64  # (S,) of the level of each segment's score, predicted from its steps alone
 
 
+def step_deviations(model: Model, features: Iterable[Tensor]) -> F64:
+    """Standard deviations (N,) of rewards of single steps.
+
+    Args:
+        model: a fitted regression.
+        features: (N, D) of the steps, in pieces.
+    """
+    parts = [model.posterior.variances(piece.double()).numpy() for piece in features]
+    found: F64 = np.sqrt(np.concatenate(parts) + np.exp(model.theta[-2]))
+    return found
+
+
 def deviations(model: Model, features: list[Tensor], m: I64) -> Deviations:
     """Standard deviations of steps and segments, F linearised at the present f.
 
@@ -42,11 +55,10 @@ def deviations(model: Model, features: list[Tensor], m: I64) -> Deviations:
         m: (S,) the segments' steps.
     """
     step_noise, score_noise = np.exp(model.theta[-2:])
-    steps = [model.posterior.variances(piece.double()).numpy() for piece in features]
     rows, slopes = _level_rows(model, features, m)
     spread = np.add.reduceat(slopes * slopes, np.cumsum(m) - m)
     levels = model.posterior.variances(rows).numpy() + step_noise * spread + score_noise
-    return Deviations(np.sqrt(np.concatenate(steps) + step_noise), np.sqrt(levels))
+    return Deviations(step_deviations(model, features), np.sqrt(levels))
 
 
 def level_covariance(model: Model, features: list[Tensor], m: I64) -> F64:

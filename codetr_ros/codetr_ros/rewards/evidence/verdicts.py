@@ -3,11 +3,13 @@
 The formulas: docs/methods.md#evidence.
 
 A verdict states between which two thresholds the level of a segment lies, with noise of its own:
-P(verdict <= k) = Phi((b_k - L) / tau), the ordinal probit model. Thresholds b and tau are those
-under which the verdicts are likeliest, each level as predicted from all other verdicts. What a
-verdict then contributes to the regression is a level and a variance of it (a site of expectation
-propagation; Minka, 2001; Chu and Ghahramani, 2005). All of this is decided here; the trial took
-verdicts for numbers.
+P(verdict <= k) = Phi((b_k - L) / tau), the ordinal probit model; but for a share of lapses, which
+are any of the K verdicts, whatever the level. Thresholds b and tau are those under which the
+verdicts are likeliest, each level as predicted from all other verdicts. The share of lapses is
+fixed: a learnt one explains verdicts that are rare. What a verdict then contributes to the
+regression is a level and a variance of it (a site of expectation propagation; Minka, 2001; Chu and
+Ghahramani, 2005): little where it is likely to be a lapse. All of this is decided here; the trial
+took verdicts for numbers.
 """
 
 from dataclasses import dataclass
@@ -16,11 +18,18 @@ import numpy as np
 from scipy.special import log_ndtr, ndtr, ndtri
 
 from codetr_ros.records import F64
+from codetr_ros.rewards.base import RewardModelError
 
 LEAST_NOISE, MOST_NOISE = 0.03, 10.0
 """Bounds of tau, in units of the deviation of levels."""
 PRIOR_NOISE = 0.3
 """Where the prior of tau is centred; its logarithm has variance 1."""
+LAPSES = 0.1
+"""Share of verdicts that have nothing to do with the level."""
+MOST_VALUES = 32
+"""Of an ordinal scale."""
+FEW_VALUES = 10
+"""Different scores up to which they are taken for verdicts where nobody says what they are."""
 FAR = 30.0
 """Deviations from the mean at which a normal distribution ends."""
 
@@ -73,7 +82,36 @@ class Verdicts:
         finite = [np.where(np.isfinite(z), z, 0.0) for z in (below, above)]
         bend = slope**2 - (finite[0] * up - finite[1] * down) / total**2
         bend = np.clip(bend, 1e-9 / total**2, 1 / total**2)
+        meant = np.exp(np.log1p(-LAPSES) + mass - self._with_lapses(mass))  # so likely no lapse
+        bend = meant * (bend - (1 - meant) * slope**2)
+        slope = meant * slope
         return mean + variance * slope, np.maximum(variance - variance**2 * bend, 1e-12)
+
+    def _with_lapses(self, mass: F64) -> F64:
+        """Logarithm of how likely verdicts are.
+
+        Args:
+            mass: (S,) logarithm of how likely they are where they are no lapses.
+        """
+        likely: F64 = np.logaddexp(np.log1p(-LAPSES) + mass, np.log(LAPSES / len(self.values)))
+        return likely
+
+    def revealed(self, mean: F64, variance: F64) -> F64:
+        """Share (S,) of the variance of levels that their verdicts are expected to remove.
+
+        Args:
+            mean: (S,) of the levels before their verdicts are known.
+            variance: (S,) of the same.
+        """
+        total = np.sqrt(variance + self.tau**2)
+        left = np.zeros(len(mean))
+        for value in self.values:
+            scores = np.full(len(mean), value)
+            below, above = ((b - mean) / total for b in self.of(scores))
+            likely = np.exp(self._with_lapses(_log_mass(below, above)))
+            left += likely * self.expected(scores, mean, variance)[1]
+        share: F64 = np.clip(1 - left / variance, 0, 1)
+        return share
 
     def sites(self, scores: F64, mean: F64, variance: F64) -> tuple[F64, F64]:
         """The levels (S,) and their variances (S,) that stand for the verdicts in a regression.
@@ -103,7 +141,7 @@ class Verdicts:
         def scale(x: F64) -> tuple[F64, float]:
             steps = np.exp(np.clip(x[1:-1], -12, 4)) * unit
             thresholds = x[0] * unit + np.concatenate([[0.0], np.cumsum(steps)])
-            return thresholds, float(np.clip(np.exp(x[-1]), LEAST_NOISE, MOST_NOISE)) * unit
+            return thresholds, float(np.clip(np.exp(x[-1]), LEAST_NOISE, MOST_NOISE) * unit)
 
         def loss(x: F64) -> float:
             thresholds, tau = scale(x)
@@ -111,19 +149,20 @@ class Verdicts:
             high = np.concatenate([thresholds, [np.inf]])[places]
             total = np.sqrt(variance + tau**2)
             mass = _log_mass((low - mean) / total, (high - mean) / total)
-            return -float(mass.sum()) + 0.5 * float((x[-1] - np.log(PRIOR_NOISE)) ** 2)
+            away = float(x[-1] - np.log(PRIOR_NOISE))
+            return -float(self._with_lapses(mass).sum()) + 0.5 * away**2
 
         steps = np.log(np.maximum(np.diff(self.thresholds), 1e-4 * unit) / unit)
         begin = np.concatenate([[self.thresholds[0] / unit], steps, [np.log(self.tau / unit)]])
         best = minimize(loss, begin, method='L-BFGS-B', options={'maxiter': 30})
         thresholds, tau = scale(np.asarray(best.x, np.float64))
-        return Verdicts(self.values, thresholds, float(tau), float(variance.mean()))
+        return Verdicts(self.values, thresholds, tau, float(variance.mean()))
 
     def log_likelihood(self, scores: F64, mean: F64, variance: F64) -> float:
         """Of verdicts (S,), their levels distributed as stated."""
         total = np.sqrt(variance + self.tau**2)
         below, above = ((b - mean) / total for b in self.of(scores))
-        return float(_log_mass(below, above).sum())
+        return float(self._with_lapses(_log_mass(below, above)).sum())
 
     def mean_value(self, level: F64) -> F64:
         """The mean verdict (S,), as a number, on segments of predicted levels (S,)."""
@@ -131,7 +170,7 @@ class Verdicts:
         below = ndtr((self.thresholds - level[:, None]) / total)  # (S, K - 1)
         ends = np.concatenate([np.zeros((len(level), 1)), below, np.ones((len(level), 1))], 1)
         mean: F64 = np.diff(ends) @ self.values
-        return mean
+        return (1 - LAPSES) * mean + LAPSES * float(self.values.mean())
 
     def moved(self, factor: float, shift: float) -> 'Verdicts':
         """The same scale in other units: each level times `factor`, plus `shift`."""
@@ -140,6 +179,35 @@ class Verdicts:
             self.thresholds * factor + shift,
             self.tau * factor,
             self.spread * factor**2,
+        )
+
+
+def are_verdicts(scores: F64, stated: bool) -> bool:
+    """Whether the scores that scorers have given so far can be taken for verdicts.
+
+    Args:
+        scores: (S,) of segments; of several scorers, brought to one scale.
+        stated: the settings say that they are; else few different values must come often.
+    """
+    values = len(np.unique(scores))
+    if stated:
+        return 2 <= values <= MOST_VALUES
+    return 2 <= values <= FEW_VALUES and len(scores) >= 2 * values
+
+
+def require_few_values(scores: F64) -> None:
+    """Refuse scores that cannot be those of an ordinal scale.
+
+    Raises:
+        RewardModelError: they have one value only, or too many.
+    """
+    values = np.unique(scores)
+    if not 2 <= len(values) <= MOST_VALUES:
+        shown = ', '.join(f'{value:g}' for value in values[:3])
+        raise RewardModelError(
+            f'evidence.score_scale = ordinal: the {len(scores)} scores have {len(values)} '
+            f'different values ({shown}, ...), an ordinal scale has 2 to {MOST_VALUES}. Set '
+            'evidence.score_scale to numbers'
         )
 
 
