@@ -91,6 +91,16 @@ def test_a_commit_of_less_than_was_permitted_is_refused_even_with_the_right_dige
     assert it.take(0, memory) and memory.steps == 5
 
 
+def test_a_commit_of_a_phase_whose_end_nobody_has_marked_is_refused_by_that_reason(caplog):
+    it, memory = intake()
+    steps = chunk(phase_end=False)
+    for each in (steps, committed(steps)):
+        it.receive(each)
+    assert not it.take(0, memory) and it.refused == {'commits': 1}
+    assert "names all 5 steps of 'sim', of which the last must have phase_end" in caplog.text
+    assert 'these chunks have it: none' in caplog.text
+
+
 def test_a_commit_that_leaves_out_scores_that_are_due_is_refused(caplog):
     it, memory = intake()
     steps, due = chunk(scores_due=1), score(length=5)

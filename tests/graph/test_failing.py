@@ -75,6 +75,8 @@ def test_a_node_that_has_given_up_is_one_that_has_failed(tmp_path):
     assert codes['learner'] == codes['sim'] == codes['record'] == 1, codes
     assert 'Traceback' not in nodes.log('learner')
     assert f'learner {NAMESPACE}/learner has given up' in nodes.log('sim')
+    for name in ('sim', 'record'):  # they have ended because of it, and name what it met
+        assert str(checkpoints) in nodes.report(name)['error']
 
 
 def test_a_folder_that_cannot_be_written_is_refused_at_once_and_in_one_line(tmp_path):

@@ -159,6 +159,10 @@ def never_give_up(patch):
     patch.setattr(patience.Patience, 'check', lambda self, now, waiting, doing, lost: None)
 
 
+def wait_with_all_others(patch):
+    patch.setattr(patience.Patience, '_check_endless', lambda self, now, mine: None)
+
+
 def end_before_all_is_there(patch):
     patch.setattr(settling.Settling, 'check', lambda self, missing, seconds, now: (True, ''))
 
@@ -196,6 +200,7 @@ MENDS: dict[Callable, str] = {
     compare_no_digests: 'other weights|fault',
     judge_before_records_were_in_doubt: 'gave up',
     never_give_up: 'stuck',
+    wait_with_all_others: 'stuck',
     end_before_all_is_there: 'were published on|names no cause|not sound',
     take_labels_again: 'repeated messages',
     believe_strangers: 'other weights|not sound|gave up|fault',
@@ -207,7 +212,7 @@ def overrun(planned):
     return replace(planned, weather=replace(planned.weather, overrun=0.05), heals=False)
 
 
-PLANS = {accept_gaps: overrun}
+PLANS = {accept_gaps: overrun, wait_with_all_others: overrun}
 """What is rare among the seeds is planned."""
 
 

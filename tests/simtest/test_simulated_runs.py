@@ -1,6 +1,7 @@
 """Runs in which messages, disks and nodes fail end as if nothing had happened, or by name."""
 
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -8,7 +9,9 @@ from dataclasses import replace
 import pytest
 
 from codetr_ros.simtest.disks import Trouble
-from codetr_ros.simtest.plan import all_settings, plan
+from codetr_ros.simtest.network import Weather
+from codetr_ros.simtest.plan import DEADLINE, all_settings, plan
+from codetr_ros.simtest.process import Pace
 from codetr_ros.simtest.run import carry_out, simulate
 
 QUICK, MANY = range(24), range(24, 200)
@@ -54,6 +57,25 @@ def test_a_run_that_cannot_be_mended_ends_by_errors_that_name_a_cause():
         assert cause in ended.errors['record']
         assert 'record /record' in ended.errors['learner']
         assert ended.failures == []
+
+
+def test_a_wait_that_nobody_can_end_ends_at_the_deadline_and_names_who_waits_for_what():
+    seed = next(i for i, each in enumerate(all_settings()) if each.method == 'rrd')
+    calm = Weather(delay=0.01, overrun=0.2)
+    planned = replace(plan(seed), weather=calm, disk=Trouble(), heals=False)
+    ended = carry_out(replace(planned, paces=dict.fromkeys(planned.paces, Pace())))
+    assert ended.failures == []
+    assert set(ended.errors) == set(planned.paces)
+    assert DEADLINE < ended.seconds < DEADLINE + 20
+    for error in ended.errors.values():  # each names the one that lacks something, and what
+        assert re.search(r"record waits for the rest of phase \d+: \d+ .* of 'sim'", error), error
+
+
+def test_what_made_a_chain_of_nodes_give_up_is_named_by_all_of_them():
+    ended = carry_out(replace(plan(0), disk=Trouble(room=60_000), heals=False))
+    assert set(ended.errors) == set(plan(0).paces)
+    for error in ended.errors.values():
+        assert 'No space left on device' in error, ended.errors
 
 
 PROGRAM = """

@@ -87,6 +87,10 @@ class Evaluator(Part):
             self._seen.add(policy.version)
             self._waiting.append(('evaluation', policy.version, acting))
 
+    def waiting_for(self) -> str:
+        """What the next slice waits for, for people."""
+        return 'a policy that is to be evaluated, from the learner'
+
     def work(self) -> Iterator[list[Record] | None]:
         """Evaluate one episode per slice."""
         while True:

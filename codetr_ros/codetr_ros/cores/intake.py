@@ -273,11 +273,18 @@ class Intake:
             due, taken = shares[one.name], sum(chunk.steps for chunk in one.records)
             ends = [chunk.phase_end for chunk in one.records]
             other = [chunk.phase for chunk in one.records if chunk.phase != commit.phase]
-            if taken != due or other or not ends[-1] or sum(ends) != 1:
+            if taken != due or other:
                 return (
                     f'names {taken} steps of {one.name!r}, of {due} that were permitted'
                     + (f', some of them of phase {other[0]}' if other else '')
                     + ': stop what publishes it'
+                )
+            if not ends[-1] or sum(ends) != 1:
+                marked = [c.sequence for c in one.records if c.phase_end] or 'none'
+                return (
+                    f'names all {due} steps of {one.name!r}, of which the last must have '
+                    f'phase_end and no other; these chunks have it: {marked}. Let the simulator '
+                    'mark the end of each phase, or stop what publishes the commit'
                 )
         if not self._scores or self._settings.scored_elsewhere:
             return ''

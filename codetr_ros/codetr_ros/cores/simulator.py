@@ -177,6 +177,10 @@ class Simulator(Part):
         """The next phase to be run."""
         return self._phase
 
+    def waiting_for(self) -> str:
+        """What the next slice waits for, for people."""
+        return f'permission for phase {self._phase} from the learner'
+
     def work(self) -> Iterator[list[Record] | None]:
         """Yield what is simulated, then per slice a chunk of each source, of at most `CHUNK_STEPS`
         steps.

@@ -204,6 +204,7 @@ class KeptRun:
         """What was recorded, and where."""
         return BagReport(
             recorded=dict(self.recorded),
+            different=dict(self.repeats.different),
             bag=str(self.folder) if self._writer else None,
             bag_bytes=self._writer.size if self._writer else 0,
             flush_seconds=self._flushes.seconds,

@@ -1,11 +1,13 @@
-"""When waiting is pointless: the awaited records are lost, or their publisher is gone."""
+"""When waiting is pointless: the awaited records are lost, their publisher is gone, or everybody
+waits.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 from codetr_ros.nodes.errors import NodeError
-from codetr_ros.nodes.peers import Peers
+from codetr_ros.nodes.peers import Peer, Peers
 from codetr_ros.records.roles import TABLE
 
 NAME_EVERY = 5.0  # [s] between two warnings about the same peers
@@ -43,10 +45,18 @@ class Patience:
         topics: those on which the awaited records arrive.
         limit: how long it waits.
         log: logs warnings.
+        outside: whether a node of the run may wait for what no other node brings: a robot for a
+            person, for example. Then nobody can know that everybody waits in vain.
     """
 
     def __init__(
-        self, who: str, peers: Peers, topics: Sequence[str], limit: Limit, log: Warns
+        self,
+        who: str,
+        peers: Peers,
+        topics: Sequence[str],
+        limit: Limit,
+        log: Warns,
+        outside: bool = False,
     ) -> None:
         self._who = who
         self._peers = peers
@@ -55,6 +65,7 @@ class Patience:
         self._limit = f'{limit.setting}: {limit.seconds:g} s'
         self._again = limit.again
         self._log = log
+        self._outside = outside
         self._named: dict[str, float] = {}
 
     def check(self, now: float, waiting: float, doing: str, lost: Mapping[str, int]) -> None:
@@ -68,28 +79,65 @@ class Patience:
                 fetched again.
 
         Raises:
-            NodeError: an awaited peer is gone, or awaited records are lost.
+            NodeError: an awaited peer is gone, awaited records are lost, or everybody waits.
         """
         self._check_silent(now, waiting, doing)
         self._check_finished(now, waiting, doing)
-        if lost and self._deadline and waiting > self._deadline:
-            lacking = ', '.join(f'{n} of {topic!r}' for topic, n in sorted(lost.items()))
-            raise NodeError(
-                f'{self._who} gave up after {waiting:.0f} s: it {doing}, and messages that were '
-                f'published never reached it: {lacking} ({self._limit}). Look for an overloaded '
-                f'machine or network, and {self._again}'
-            )
+        if not self._deadline or waiting <= self._deadline:
+            return
+        lacking = ', '.join(f'{n} of {topic!r}' for topic, n in sorted(lost.items()))
+        never = f'messages that were published never reached it: {lacking}' if lost else ''
+        working = [peer for peer in self._others(now) if not peer.presence.waiting]
+        if self._outside or working:
+            if lost:
+                raise NodeError(
+                    f'{self._who} gave up after {waiting:.0f} s: it {doing}, and {never} '
+                    f'({self._limit}). Look for an overloaded machine or network, and '
+                    f'{self._again}'
+                )
+            return
+        self._check_endless(now, f'{waiting:.0f} s: it {doing}{never and ", " + never}')
+
+    def _others(self, now: float) -> list[Peer]:
+        """The nodes that have not ended and are not silent."""
+        return [
+            peer
+            for peer in self._peers.newest()
+            if not peer.presence.finished and now - peer.received_at <= self._deadline
+        ]
+
+    def _because(self, text: str, cause: str) -> NodeError:
+        """An error that names the first cause, if another node has one."""
+        if not cause:
+            return NodeError(text)
+        return NodeError(f'{text}. What came first: {cause}', cause)
+
+    def _check_endless(self, now: float, mine: str) -> None:
+        """Give up once all others have waited as long: nothing is under way."""
+        others = self._others(now)
+        if any(peer.presence.waiting <= self._deadline for peer in others):
+            return
+        waits = [
+            f'{peer.who} {peer.presence.doing} ({peer.presence.waiting:.0f} s)' for peer in others
+        ]
+        raise self._because(
+            f'{self._who} gave up after {mine}; nobody is left who could end that: '
+            f'{"; ".join(waits) or "all others have ended or are silent"} ({self._limit}). '
+            f'Look for the node that lacks what another has published, and {self._again}',
+            self._peers.cause(),
+        )
 
     def _check_silent(self, now: float, waiting: float, doing: str) -> None:
         for peer in self._peers.awaited(self._topics):
             silent = now - peer.received_at
             if peer.presence.finished or silent < 2 * NAME_EVERY:
                 continue
-            who = f'{peer.presence.role} {peer.presence.node}'
+            who = peer.who
             if self._deadline and silent > self._deadline and waiting > self._deadline:
-                raise NodeError(
+                raise self._because(
                     f'{self._who} gave up: it {doing}, and {who} has been silent for '
-                    f'{silent:.0f} s ({self._limit}). Look at its log, and {self._again}'
+                    f'{silent:.0f} s ({self._limit}). Look at its log, and {self._again}',
+                    self._peers.cause(),
                 )
             if now - self._named.get(who, 0.0) > NAME_EVERY:
                 self._named[who] = now
@@ -103,7 +151,9 @@ class Patience:
             settled = all(now - peer.received_at > GRACE for peer in gone)
             if gone and waiting > patience and settled:
                 names = ', '.join(peer.presence.node for peer in gone)
-                raise NodeError(
+                causes = [peer.cause for peer in gone if peer.cause]
+                raise self._because(
                     f'{self._who} gave up: it {doing}, but {role} {names} stopped before the run '
-                    f'was over. Look at its log, and {self._again}'
+                    f'was over. Look at its log, and {self._again}',
+                    causes[0] if causes else self._peers.cause(),
                 )

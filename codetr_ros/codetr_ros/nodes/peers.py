@@ -11,7 +11,11 @@ from dataclasses import dataclass, field
 
 from codetr_ros.config import Settings
 from codetr_ros.records import Presence, roles
+from codetr_ros.records.roles import TABLE
 from codetr_ros.system.liveness import has_ended
+
+GAVE_UP = 'has given up: '
+"""Begins what a node does, in its last presence, if it has given up; its first cause follows."""
 
 
 @dataclass
@@ -27,6 +31,24 @@ class Peer:
         """Counts of the records that it has published, by topic."""
         presence = self.presence
         return dict(zip(presence.topics, presence.published.tolist(), strict=True))
+
+    @property
+    def who(self) -> str:
+        """Its role and name."""
+        return f'{self.presence.role} {self.presence.node}'
+
+    @property
+    def cause(self) -> str:
+        """The first cause for which it has given up, as far as it is known; else empty."""
+        presence = self.presence
+        if not presence.finished or not presence.doing.startswith(GAVE_UP):
+            return ''
+        return presence.doing.removeprefix(GAVE_UP)
+
+    @property
+    def dispensable(self) -> bool:
+        """Whether the run goes on without it, and ends well."""
+        return TABLE[self.presence.role].dispensable
 
     @property
     def failed(self) -> bool:
@@ -95,6 +117,10 @@ class Peers:
                 p.presence.node for p in there if p not in ready and not p.presence.finished
             ]:
                 missing.append(f'{role}{of} ({", ".join(starting)} is there, but not ready yet)')
+            elif given_up := [
+                f'{p.presence.node} has given up: {p.cause}' for p in there if p.cause
+            ]:
+                missing.append(f'{role}{of} ({"; ".join(given_up)})')
             else:
                 start = roles.command(role)
                 missing.append(f'{role}{of} (start it with `{start}` in this namespace)')
@@ -107,20 +133,45 @@ class Peers:
 
     def failed(self, among: Iterable[Peer] | None = None) -> list[str]:
         """Roles and names of the nodes that have died or else, since a node that dies makes others
-        give up, of those that have given up, in words.
+        give up, of those that have given up, in words. Nodes that the run can do without are left
+        out.
 
         Args:
             among: the nodes that count; None: all.
         """
         died, given_up = [], []
         for peer in self.newest() if among is None else among:
-            if peer.failed:
-                who = f'{peer.presence.role} {peer.presence.node} has'
+            if peer.failed and not peer.dispensable:
                 if peer.presence.finished:
-                    given_up.append(f'{who} given up')
+                    why = f' ({peer.cause})' if peer.cause else ''
+                    given_up.append(f'{peer.who} has given up{why}')
                 else:
-                    died.append(f'{who} died')
+                    died.append(f'{peer.who} has died')
         return died or given_up
+
+    def cause(self) -> str:
+        """The first cause for which others have given up, as far as it is known; else empty.
+        Nodes that the run can do without are left out.
+        """
+        causes = (peer.cause for peer in self.newest() if not peer.dispensable)
+        return next(filter(None, causes), '')
+
+    def abandoned(self, now: float, grace: float, deadline: float) -> list[Peer]:
+        """Nodes that the run can do without, and that have given up or are gone.
+
+        Args:
+            now: monotonic time [s].
+            grace: seconds in which one that has died may be started again.
+            deadline: seconds of silence after which one is gone; 0: never.
+        """
+
+        def gone(peer: Peer) -> bool:
+            if peer.presence.finished:
+                return peer.failed
+            silent = now - peer.received_at
+            return silent > grace if peer.failed else 0 < deadline < silent
+
+        return [peer for peer in self.newest() if peer.dispensable and gone(peer)]
 
     def restarted(self, presence: Presence) -> bool:
         """Whether an instance of a node has taken the place of another one."""

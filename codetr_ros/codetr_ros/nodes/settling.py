@@ -31,6 +31,10 @@ def still_missing(
 class Settling:
     """Watches over the end of a run.
 
+    Attributes:
+        without: roles and names of the nodes without which it has ended: the run needs nothing of
+            them.
+
     Args:
         who: the recorder's full name.
         peers: the other nodes.
@@ -49,6 +53,7 @@ class Settling:
         self._peers = peers
         self._deadline = limit.seconds
         self._gone = gone
+        self.without: list[str] = []
 
     def check(self, missing: Mapping[str, int], seconds: float, now: float) -> tuple[bool, str]:
         """Whether all nodes have finished and nothing is missing; and what the recorder does.
@@ -62,7 +67,13 @@ class Settling:
             NodeError: a node has ended too early, or records never arrived.
         """
         grace = max(GRACE, self._deadline)  # one that was killed may be started again meanwhile
-        awaited = [p for p in self._peers.newest() if not self._gone(p, now)]
+        gone = self._peers.abandoned(now, grace, self._deadline)
+        self.without = [peer.who for peer in gone]
+        excused: Counter[str] = Counter()  # it may have died before that was sent
+        for peer in gone:
+            excused.update(peer.published)
+        missing = {t: n - excused[t] for t, n in missing.items() if n > excused[t]}
+        awaited = [p for p in self._peers.newest() if p not in gone and not self._gone(p, now)]
         there = [
             p
             for p in awaited
@@ -73,7 +84,8 @@ class Settling:
             if failed := self._peers.failed(awaited):
                 raise NodeError(
                     f'{self._who}: every phase is recorded, but {"; ".join(failed)}, and the bag '
-                    'lacks what was still to come from there. Look at the log of that node'
+                    'lacks what was still to come from there. Look at the log of that node',
+                    self._peers.cause(),
                 )
             return True, 'has finished'
         lacking = [f'{n} of {topic}' for topic, n in missing.items()]
@@ -85,6 +97,7 @@ class Settling:
         newest_at = max((p.received_at for p in there), default=0.0)
         if self._deadline and min(seconds, now - newest_at) > self._deadline:
             raise NodeError(
-                f'{self._who} gave up after {self._deadline:g} s: {doing}. The bag lacks that'
+                f'{self._who} gave up after {self._deadline:g} s: {doing}. The bag lacks that',
+                self._peers.cause(),
             )
         return False, doing

@@ -61,6 +61,7 @@ class Role:
             of such a role has finished only if it was stopped.
         count: how many nodes a run needs.
         reads_unlabelled: what it reads instead where nobody labels steps.
+        dispensable: whether a run that has begun goes on and ends well without it.
     """
 
     package: str
@@ -70,6 +71,7 @@ class Role:
     relies_on: tuple[str, ...]
     count: Callable[[DecidingSettings], int] = lambda settings: 1
     reads_unlabelled: tuple[type, ...] | None = None
+    dispensable: bool = False
 
 
 TABLE: dict[str, Role] = {
@@ -86,6 +88,7 @@ TABLE: dict[str, Role] = {
         reads=(RunSpec, Policy),
         relies_on=('learner',),
         count=lambda settings: int(settings.evaluate_every > 0),
+        dispensable=True,
     ),
     'reward': Role(
         'reward_node', 'reward',

@@ -57,7 +57,8 @@ def wait_for(member: Waiter, lacks: Callable[[], Sequence[str]]) -> bool:
         if member.deadline and now - began > member.deadline:
             raise NodeError(
                 f'{member.link.full_name} gave up after {member.deadline:g} s: it {doing}. '
-                f'A larger {member.deadline_is} makes it wait longer'
+                f'A larger {member.deadline_is} makes it wait longer',
+                member.peers.cause(),
             )
         if now - named >= NAME_EVERY:
             named = now

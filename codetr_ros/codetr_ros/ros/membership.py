@@ -12,10 +12,10 @@ import numpy as np
 from codetr_ros.config import Settings, SettingsError, from_canonical
 from codetr_ros.cores.core import Core
 from codetr_ros.nodes.admission import Admission
-from codetr_ros.nodes.errors import NodeError
+from codetr_ros.nodes.errors import NodeError, first_cause
 from codetr_ros.nodes.outbox import Outbox
 from codetr_ros.nodes.patience import Limit, Patience
-from codetr_ros.nodes.peers import Peers
+from codetr_ros.nodes.peers import GAVE_UP, Peers
 from codetr_ros.nodes.traffic import Traffic
 from codetr_ros.records import (
     PROTOCOL_VERSION,
@@ -111,6 +111,7 @@ class Membership:
         self._outbox: Outbox | None = None
         self._logged: set[str] = set()  # errors that are logged once
         self._presence_at = 0.0
+        self._cause = ''  # why it has given up
 
     @property
     def folder(self) -> Path | None:
@@ -138,7 +139,9 @@ class Membership:
 
     def patience(self, topics: Sequence[str]) -> Patience:
         """What watches over this node while it waits for records on these topics."""
-        return Patience(self.link.full_name, self.peers, topics, self.limit, self.log)
+        settings = self.traffic.settings
+        outside = settings is not None and settings.on_robot
+        return Patience(self.link.full_name, self.peers, topics, self.limit, self.log, outside)
 
     def introduce(self) -> None:
         """Declare the node's own parameters, and subscribe to presences and runs.
@@ -346,14 +349,20 @@ class Membership:
             self._logged.add(text)
             self.log.error(text)
 
-    def give_up(self) -> None:
-        """Let the other nodes know, by the presences to come, that this one has failed."""
+    def give_up(self, error: BaseException | str) -> None:
+        """Let the other nodes know, by the presences to come, that this one has failed, and the
+        first cause of it.
+        """
         for each in (self, *self.company):
             each._serves = False  # noqa: SLF001 - members of the same process
+            each._cause = each._cause or first_cause(  # noqa: SLF001
+                error, f'{each.role} {each.link.full_name}'
+            )
 
     def publish_presence(self) -> None:
         """Publish the node's presence, and the counts of its messages on /diagnostics."""
         finished = self.over
+        last = f'{GAVE_UP}{self._cause}' if self._cause else 'has finished'
         self._presence_at = time.monotonic()
         if self.outside:
             return
@@ -370,14 +379,14 @@ class Membership:
                 topics=topics,
                 published=np.array([self.link.published[t] for t in topics], np.uint64),
                 missed=sum(counters['lost'].values()),
-                doing='has finished' if finished else self.doing[:LONGEST_DOING],
+                doing=(last if finished else self.doing)[:LONGEST_DOING],
                 waiting=self._waiting(finished),
             )
         )
         wrong = bool(counters['lost'] or counters['refused'])
         self.link.diagnose(
             link.WARN if wrong else link.OK,
-            'has finished' if finished else self.doing,
+            last if finished else self.doing,
             {'published': dict(self.link.published)} | counters,
         )
 

@@ -71,6 +71,7 @@ class Node:
         except Exception as problem:  # noqa: BLE001 - report and last presence must go out
             self._sound = self._sound and errors.explains_itself(problem)
             error = errors.in_words(problem)
+            self.member.give_up(problem)
             self._log_fatal(problem)
         return self._end(wiring, error)
 
@@ -138,7 +139,7 @@ class Node:
         if stop.signal and not finished:
             error = error or self._deserted(stop.signal)
         if error:
-            self.member.give_up()
+            self.member.give_up(error)
         steps: list[Callable[[], None]] = [
             lambda: self._report(wiring, finished, error),
             lambda: self._linger(finished),
@@ -154,7 +155,7 @@ class Node:
             except Exception as problem:  # noqa: BLE001 - one failure must not stop the rest
                 error = error or errors.in_words(problem)
                 self._log_fatal(problem, 'at the end: ')
-                self.member.give_up()
+                self.member.give_up(problem)
         if stop.signal and not error and not finished:
             self._log.info(f'stopped by {stop.signal.name}')
         code = 1 if error else 0

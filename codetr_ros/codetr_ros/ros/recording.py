@@ -282,6 +282,11 @@ class Recording(Wiring):
         settled, member.doing = self._settling.check(missing, seconds, time.monotonic())
         if not settled:
             self._ask_again(missing)
+        elif self._settling.without:
+            self.log.warning(
+                f'ends without {", ".join(self._settling.without)}: what was still to come from '
+                'there is not in the bag'
+            )
         return settled
 
     def close(self) -> None:

@@ -58,7 +58,8 @@ def result_rows(summary: RunSummary) -> list[tuple[str, str]]:
         (
             'messages',
             f'{sum(row.published for row in summary.messages.values())} published, '
-            f'{summary.lost} lost, {summary.duplicated} duplicated, {summary.refused} refused',
+            f'{summary.lost} lost, {summary.duplicated} duplicated, {summary.refused} refused'
+            + (f', {summary.different} came again as others' if summary.different else ''),
         ),
         *_left_out(summary),
     ]

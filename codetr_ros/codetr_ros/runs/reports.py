@@ -95,6 +95,11 @@ class BagReport(Facts):
     """The recorder's further facts: what it has written, and how long the disk took."""
 
     recorded: Counts = Field({}, description='records that it wrote into the bag, by topic')
+    different: Counts = Field(
+        {},
+        description='records that came again and were others than before, by topic: what '
+        'published them is not deterministic',
+    )
     bag: str | None = Field(None, description='folder of the bag that it wrote')
     bag_bytes: int | None = Field(None, description='size of the bag [bytes]')
     flush_seconds: float | None = Field(

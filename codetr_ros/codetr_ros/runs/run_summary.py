@@ -69,6 +69,11 @@ class MessageCounts(Facts):
     lost: int = Field(description='that never reached a node that reads the topic')
     duplicated: int = Field(description='that reached a node more than once')
     refused: int = Field(description='that a node refused')
+    different: int = Field(
+        0,
+        description='that came again, from a node that was started again, and were others than '
+        'before',
+    )
 
 
 class ScorerRow(Facts):
@@ -174,6 +179,11 @@ class RunSummary(Facts):
     refused: int = Field(description='refused messages, all topics together')
     left_out: Counts = Field(
         {}, description='phases that each source was left out of, because nothing came from it'
+    )
+    different: int = Field(
+        0,
+        description='messages that came again and were others than before, all topics together: '
+        'what published them is not deterministic',
     )
     scorers: dict[str, ScorerRow] = Field(
         {}, description='who scored, by name, where others than the simulator did'

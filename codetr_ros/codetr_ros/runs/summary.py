@@ -274,6 +274,7 @@ class Summary:
             duplicated=sum(row.duplicated for row in messages.values()),
             refused=sum(row.refused for row in messages.values()),
             left_out=self._leavers.phases,
+            different=sum(row.different for row in messages.values()),
             scorers=scorers.rows(
                 (name, value)
                 for _, values in sorted(self._metrics.items())

@@ -21,6 +21,7 @@ def count_messages(reports: Mapping[str, NodeReport]) -> dict[str, MessageCounts
             columns[f'received_by_{report.role}'].update(report.received)
         if report.role == 'record':
             columns['recorded'].update(report.recorded)
+            columns['different'].update(report.different)
         columns['lost'].update(report.lost)
         columns['duplicated'].update(report.duplicated)
         columns['refused'].update(report.refused)

@@ -16,10 +16,10 @@ from codetr_ros.config import Settings
 from codetr_ros.cores.core import Core
 from codetr_ros.cores.simulator import Simulator
 from codetr_ros.nodes.behind import Behind
-from codetr_ros.nodes.errors import NodeError
+from codetr_ros.nodes.errors import NodeError, first_cause
 from codetr_ros.nodes.fetching import Fetching
 from codetr_ros.nodes.patience import Limit, Patience
-from codetr_ros.nodes.peers import Peers
+from codetr_ros.nodes.peers import GAVE_UP, Peers
 from codetr_ros.nodes.traffic import Traffic
 from codetr_ros.records import TOPICS, Commit, Presence, Record, RunSpec, describe
 from codetr_ros.records.roles import published_by
@@ -256,7 +256,10 @@ class Process:
         if doing != self.doing:
             self.doing, self._waiting = doing, now
         if self._waiting is not None and now - self._waiting > self.limit.seconds:
-            raise NodeError(f'/{self.name} gave up after {self.limit.seconds:g} s: it {doing}')
+            raise NodeError(
+                f'/{self.name} gave up after {self.limit.seconds:g} s: it {doing}',
+                self.peers.cause(),
+            )
         return False
 
     # ---- messages
@@ -306,6 +309,12 @@ class Process:
         """Publish the presence."""
         self._presence_at = self.world.now
         topics = tuple(t for t in published_by(self.role) if t in self.published)
+        doing, waiting = self.doing, 0.0
+        if self.ended:
+            cause = self.error and first_cause(self.error, f'{self.role} /{self.name}')
+            doing = f'{GAVE_UP}{cause}' if cause else 'has finished'
+        elif self._waiting is not None:
+            waiting = self.world.now - self._waiting
         presence = Presence(
             run_id=self.run.run_id,
             role=self.role,
@@ -316,6 +325,8 @@ class Process:
             topics=topics,
             published=np.array([self.published[t] for t in topics], np.uint64),
             missed=sum(self.traffic.lost().values()),
+            doing=doing,
+            waiting=waiting,
         )
         self.mail.publish(self, Packet(Presence, 0, presence))
 

@@ -55,6 +55,11 @@ class Recording(Process):
         self.recorded[TOPICS[kind]] += 1
         self.history.append((kind, raw))
 
+    @property
+    def without(self) -> list[str]:
+        """Names of the nodes without which the run has ended."""
+        return [who.rpartition('/')[2] for who in self._settling.without]
+
     def take(self, kind: type, raw: bytes) -> None:
         """Take the bytes of a message: what is admitted is written as it came."""
         record = self.traffic.decode(kind, raw)

@@ -189,8 +189,7 @@ class Simulated:
         )
         for each in processes:
             each.core.close()
-        # what never reached the recorder is not sent again, and nobody notices who waits for whom
-        if not over and not self.plan.weather.overrun:
+        if not over:
             waiting = [f'{p.name} {p.doing}' for p in processes if not p.ended]
             self.failures.append(
                 f'stuck at {self.world.now:.0f} s: nobody ends the wait: {"; ".join(waiting)}'

@@ -1,0 +1,136 @@
+"""When a node gives up waiting, and which cause it names."""
+
+import numpy as np
+import pytest
+
+from codetr_ros.nodes.errors import NodeError, first_cause
+from codetr_ros.nodes.patience import Limit, Patience
+from codetr_ros.nodes.peers import GAVE_UP, Peers
+from codetr_ros.nodes.settling import Settling
+from codetr_ros.records import Presence
+from helpers.builders import tiny
+
+DEADLINE = 60.0
+SETTINGS = tiny()
+
+
+class Log:
+    def warning(self, message):
+        pass
+
+
+def presence(role, doing='works', waiting=0.0, **changes):
+    fields = {
+        'run_id': 'run',
+        'role': role,
+        'node': f'/r/{role}',
+        'instance_id': role,
+        'settings_hash': 'hash',
+        'finished': False,
+        'topics': (),
+        'published': np.zeros(0, np.uint64),
+        'missed': 0,
+        'doing': doing,
+        'waiting': waiting,
+    }
+    return Presence(**(fields | changes))
+
+
+def a_node(role='sim', outside=False, **others):
+    """A node whose peers were last received 1 s ago: what each does, and for how long it waits."""
+    peers = Peers(role)
+    for name, (doing, waiting) in others.items():
+        peers.note(presence(name, doing, waiting), 199.0)
+    return peers, Patience(f'/r/{role}', peers, ['policy'], Limit(DEADLINE), Log(), outside)
+
+
+def test_a_node_gives_up_once_everybody_has_waited_beyond_the_deadline_and_names_who_for_what():
+    waits = {'record': ('waits for 2 scores', 61.0), 'learner': ('waits for the commit', 60.5)}
+    _, patience = a_node(**waits)
+    with pytest.raises(NodeError) as caught:
+        patience.check(200.0, 62.0, 'waits for a permission', {})
+    text = str(caught.value)
+    assert text.startswith('/r/sim gave up after 62 s: it waits for a permission; nobody is left')
+    assert 'record /r/record waits for 2 scores (61 s)' in text
+    assert 'learner /r/learner waits for the commit (60 s)' in text
+
+
+@pytest.mark.parametrize(
+    'others',
+    [
+        {'record': ('waits', 61.0), 'learner': ('works', 0.0)},
+        {'record': ('waits', 61.0), 'learner': ('waits', 59.0)},
+    ],
+    ids=['one works', 'one has not waited as long'],
+)
+def test_while_anything_is_under_way_a_node_waits_on(others):
+    _, patience = a_node(**others)
+    patience.check(200.0, 1000.0, 'waits', {})
+
+
+def test_where_a_node_may_wait_for_a_person_nobody_waits_in_vain():
+    _, patience = a_node(outside=True, record=('waits', 500.0), learner=('waits', 500.0))
+    patience.check(200.0, 500.0, 'waits', {})
+
+
+def test_a_node_that_waits_alone_gives_up_at_the_deadline():
+    peers, patience = a_node('evaluate')
+    peers.note(presence('record', finished=True), 10.0)
+    patience.check(200.0, 60.0, 'waits', {})
+    with pytest.raises(NodeError, match='all others have ended or are silent'):
+        patience.check(200.0, 61.0, 'waits', {})
+
+
+def test_the_first_cause_goes_from_node_to_node():
+    own = NodeError('/r/record gave up: no room')
+    cause = first_cause(own, 'record /r/record')
+    assert cause == '/r/record gave up: no room'
+    assert first_cause(OSError('gone'), 'record /r/record') == 'record /r/record: OSError: gone'
+    peers, patience = a_node('learner')
+    peers.note(presence('record', GAVE_UP + cause, finished=True, settings_hash=''), 100.0)
+    with pytest.raises(NodeError, match='What came first: /r/record gave up: no room') as caught:
+        patience.check(200.0, 80.0, 'waits for a commit', {})
+    assert first_cause(caught.value, 'learner /r/learner') == cause
+    assert 'no room' in peers.absent(SETTINGS, 'hash')[-1]
+    assert peers.failed() == []  # it never took part
+
+
+def evaluator(silent, **changes):
+    """A recorder that is about to end, and an evaluator that has published two results."""
+    peers = Peers('record')
+    counts = {'topics': ('episodes',), 'published': np.array([2], np.uint64)}
+    peers.note(presence('evaluate', **(counts | changes)), 200.0 - silent)
+    return Settling('/r/record', peers, Limit(DEADLINE))
+
+
+@pytest.mark.parametrize(
+    ('silent', 'changes', 'without'),
+    [
+        (1.0, {'finished': True, 'doing': 'has finished'}, []),
+        (61.0, {}, ['evaluate /r/evaluate']),
+    ],
+    ids=['has finished', 'is silent'],
+)
+def test_a_run_ends_with_or_without_its_evaluator(silent, changes, without):
+    settling = evaluator(silent, **changes)
+    assert settling.check({}, 300.0, 200.0) == (True, 'has finished')
+    assert settling.without == without
+
+
+def test_an_evaluator_that_works_is_waited_for_and_what_a_dead_one_has_published_is_not():
+    settled, doing = evaluator(1.0).check({}, 300.0, 200.0)
+    assert not settled and 'waits for the end of evaluate /r/evaluate' in doing
+    dead = evaluator(61.0)
+    assert dead.check({'episodes': 2}, 300.0, 200.0) == (True, 'has finished')
+    with pytest.raises(NodeError, match='1 of episodes'):
+        dead.check({'episodes': 3}, 300.0, 200.0)
+
+
+def test_a_run_whose_evaluator_has_given_up_ends_well():
+    peers = Peers('record')
+    peers.note(presence('evaluate'), 100.0)
+    last = presence('evaluate', f'{GAVE_UP}no such task', finished=True, settings_hash='')
+    peers.note(last, 150.0)
+    settling = Settling('/r/record', peers, Limit(DEADLINE))
+    assert settling.check({}, 1.0, 200.0) == (True, 'has finished')
+    assert settling.without == ['evaluate /r/evaluate']
