@@ -92,6 +92,18 @@ def until(found: Callable[[], bool], command: Command, folder: Path) -> None:
             raise AssertionError(f'ended with {code}:\n{command.stdout.read()}\n{logs(folder)}')
 
 
+def node_of(folder: Path, name: str) -> int:
+    """The number of the process that writes the log of a node."""
+    log = folder / 'logs' / f'{name}.log'
+    for entry in Path('/proc').glob('[0-9]*'):
+        try:
+            if (entry / 'fd' / '1').resolve() == log:
+                return int(entry.name)
+        except OSError:
+            continue  # it has ended meanwhile, or is of somebody else
+    raise AssertionError(f'no process writes {log}')
+
+
 def processes_of(folder: Path) -> list[tuple[int, str]]:
     """Number and command line of each process that has something to do with a run's folder."""
     found = []

@@ -119,6 +119,54 @@ def test_a_process_that_stays_when_all_else_has_ended_is_named_and_ended(
     assert processes.running() == []
 
 
+@pytest.mark.parametrize(
+    'program',
+    ['raise SystemExit(3)', 'import os; os.kill(os.getpid(), 9)', ''],
+    ids=['gives up', 'is killed', 'ends too early'],
+)
+def test_a_process_without_which_the_run_ends_well_may_fail(
+    tmp_path: Path, processes: Processes, said: Said, program: str
+) -> None:
+    start(processes, tmp_path, python('sim', ''), python('evaluate', program))
+
+    failure = supervise(
+        processes,
+        poll(processes),
+        Interrupts(),
+        Silence(),
+        lambda node: 'evaluate ended early' if node.name == 'evaluate' else None,
+        dispensable=lambda node: node.name == 'evaluate',
+    )
+
+    assert failure is None
+    (line,) = said
+    assert line.startswith('evaluate ') and line.endswith(': the run goes on without it')
+
+
+def test_a_process_without_which_the_run_ends_well_is_not_waited_for_long(
+    tmp_path: Path, processes: Processes, said: Said
+) -> None:
+    now = [0.0]
+    start(processes, tmp_path, python('sim', ''), python('evaluate', READY + WAIT))
+    look = poll(processes)
+
+    def seconds_pass() -> None:
+        look()
+        now[0] += 20 * (len(processes.running()) == 1)
+
+    failure = supervise(
+        processes,
+        seconds_pass,
+        Interrupts(),
+        Silence(lambda: now[0]),
+        dispensable=lambda node: node.name == 'evaluate',
+    )
+
+    assert failure is None
+    assert said == ['evaluate did not end with the rest of the run: the run goes on without it']
+    assert [node.unasked_failure for node in processes.nodes] == [False, False]
+
+
 def test_silence_is_broken_by_news_but_not_by_presence() -> None:
     now = [0.0]
     silence = Silence(lambda: now[0])

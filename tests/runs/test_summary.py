@@ -8,10 +8,11 @@ import pytest
 
 from codetr_ros.cli import results
 from codetr_ros.config import Settings
-from codetr_ros.records import metrics
+from codetr_ros.records import EpisodeResult, metrics
 from codetr_ros.runs import facts, report, summary
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.progress import Progress
+from codetr_ros.runs.reports import NodeReport
 from codetr_ros.runs.summary import Summary
 from helpers.bags import ours
 from helpers.builders import step_rewards
@@ -71,6 +72,34 @@ def test_each_evaluation_has_means_and_spread_over_its_episodes() -> None:
     assert said['random_true_return'] == 20.0
 
 
+def test_an_evaluation_that_lacks_episodes_is_no_result_and_is_counted() -> None:
+    made = Summary(SETTINGS, 'r', in_process=False)
+    for record in a_run():
+        lacking = isinstance(record, EpisodeResult) and record.purpose != 'training'
+        if not (lacking and record.version in (-1, 2) and record.episode == 1):
+            made.receive(record)
+    said = made.build({})
+
+    assert [row.step for row in said.evaluations] == [1000, 2000]
+    assert said.random is None
+    assert said.final_true_return == 125.0
+    assert said.evaluations_missing == 2
+    lacks = '2 of 4 evaluations are missing or lack episodes'
+    assert lacks in dict(report.result_rows(said))['evaluations']
+    assert lacks in report.page(said, b'')
+    steps = [row['step'] for row in table(made.metrics_csv()) if row.get('evaluation.episodes')]
+    assert steps == ['1000', '2000']
+
+
+def test_messages_that_came_again_as_others_are_shown() -> None:
+    again = NodeReport(role='record', name='record', different={'transitions': 3})
+    made = Summary(SETTINGS, 'r', in_process=False).build({'record-record': again})
+
+    assert made.different == made.messages['transitions'].different == 3
+    assert '3 came again as others' in dict(report.result_rows(made))['messages']
+    assert 'again' not in dict(report.result_rows(run_summary()))['messages']
+
+
 def test_messages_are_counted_by_topic_over_all_nodes() -> None:
     said = built()
 
@@ -82,6 +111,7 @@ def test_messages_are_counted_by_topic_over_all_nodes() -> None:
         'lost': 1,
         'duplicated': 0,
         'refused': 0,
+        'different': 0,
     }
     assert said['messages']['composite_rewards']['refused'] == 4
     assert said['messages']['composite_rewards']['lost'] == 5

@@ -15,6 +15,7 @@ from codetr_ros.cli.terminal import console, parse_arguments
 from codetr_ros.config import Settings, SettingsError, from_canonical
 from codetr_ros.records import RunSpec
 from codetr_ros.records.fields import type_name
+from codetr_ros.records.roles import TABLE
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import report, reports, run_summary
 from codetr_ros.runs.folder import RunFolderError
@@ -233,11 +234,15 @@ def _kept(built: RunSummary, before: RunSummary | None) -> dict[str, object]:
 
 def _failure(reports: Mapping[str, NodeReport]) -> str | None:
     """Why the nodes gave up, the first one first: the others followed it. None if none did."""
-    gone = sorted(reports.values(), key=lambda one: math.inf if one.wall_s is None else one.wall_s)
+    needed = [report for report in reports.values() if not TABLE[report.role].dispensable]
+    gone = sorted(needed, key=lambda one: math.inf if one.wall_s is None else one.wall_s)
     why = [f'{report.name}: {report.error}' for report in gone if report.error]
     return '; '.join(why) or None
 
 
 def _interrupted(reports: Mapping[str, NodeReport]) -> bool:
     """Whether nodes were asked to end before the run was over."""
-    return any(report.finished is False and not report.error for report in reports.values())
+    return any(
+        report.finished is False and not report.error and not TABLE[report.role].dispensable
+        for report in reports.values()
+    )

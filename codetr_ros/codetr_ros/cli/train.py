@@ -25,7 +25,7 @@ from codetr_ros.nodes.silence import LEAVE_OUT_AFTER
 from codetr_ros.processes import launcher
 from codetr_ros.processes.launcher import LaunchError
 from codetr_ros.processes.openmp import crowded, threading_environment
-from codetr_ros.processes.restarts import Restarts
+from codetr_ros.processes.restarts import Restarts, may_be_started_again
 from codetr_ros.processes.supervise import (
     Interrupts,
     Silence,
@@ -34,6 +34,7 @@ from codetr_ros.processes.supervise import (
     why_it_gave_up,
 )
 from codetr_ros.records import Record
+from codetr_ros.records.roles import TABLE
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import origin
 from codetr_ros.runs import reports as node_reports
@@ -42,6 +43,7 @@ from codetr_ros.runs.live import Live
 from codetr_ros.runs.middle import Middle
 from codetr_ros.runs.origin import Origin, held
 from codetr_ros.runs.progress import Progress
+from codetr_ros.runs.report_text import evaluations_missing
 from codetr_ros.runs.reports import NodeReport
 from codetr_ros.runs.summary import Summary
 from codetr_ros.runs.tensorboard import Events
@@ -279,6 +281,8 @@ def train(
             outcome.interrupted,
             outcome.failure,
         )
+        if built.evaluations_missing and not outcome.interrupted:
+            progress.log(f'warning: {evaluations_missing(built)}')
         try:
             audience.end()
             draw = shown.film and not outcome.interrupted and not outcome.failure
@@ -361,6 +365,7 @@ def _over_topics(
                     lambda node: why_it_gave_up(node, folder),
                     restarts=topics.restarts,
                     over=lambda node: is_over(node, folder),
+                    dispensable=lambda node: _can_do_without(node, summary),
                 )
                 watcher.poll(0.0)  # the last messages of the last node
         except LaunchError as error:
@@ -381,6 +386,14 @@ def _over_topics(
         results.complete(summary, bag, progress.log, lambda: interrupts.count > before)
     culprit = next((node.log for node in processes.nodes if node.unasked_failure), None)
     return Outcome(reports, interrupted, failure, culprit)
+
+
+def _can_do_without(node: launcher.Node, summary: Summary) -> bool:
+    """Whether a run goes on without a node that has failed for good. Nobody begins before all are
+    there: one that fails with a reason before the first commit has none to wait for.
+    """
+    begun = summary.phases > 0 or may_be_started_again(node.code) or node.code is None
+    return begun and TABLE[node.role].dispensable
 
 
 def show_failure(outcome: Outcome) -> None:

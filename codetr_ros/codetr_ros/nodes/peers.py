@@ -169,7 +169,7 @@ class Peers:
             if peer.presence.finished:
                 return peer.failed
             silent = now - peer.received_at
-            return silent > grace if peer.failed else 0 < deadline < silent
+            return (peer.failed and silent > grace) or 0 < deadline < silent
 
         return [peer for peer in self.newest() if peer.dispensable and gone(peer)]
 

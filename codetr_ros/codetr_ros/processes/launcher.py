@@ -237,7 +237,7 @@ class Node:
     log: Path
     asked: bool = False  # we sent it a signal to end
     killed: bool = False  # we killed it, because it did not end when asked
-    excused: bool = False  # it died when it had done everything
+    excused: bool = False  # its end is no failure: it had done everything, or is not needed
 
     @property
     def name(self) -> str:

@@ -15,6 +15,8 @@ from codetr_ros.runs import reports
 
 SILENCE_DEADLINE = 90.0
 """Seconds of silence after which the last nodes must have ended too."""
+LEAVE_DEADLINE = 10.0
+"""The same for nodes without which the run ends well: the others have waited for them before."""
 
 
 class Interrupts:
@@ -85,6 +87,7 @@ def supervise(
     deadline: float = SILENCE_DEADLINE,
     restarts: Restarts | None = None,
     over: Callable[[Node], bool] = lambda node: False,
+    dispensable: Callable[[Node], bool] = lambda node: False,
 ) -> str | None:
     """Watch until every process has ended; start those again that were killed, and end all of them
     if one fails or the user asks.
@@ -100,6 +103,8 @@ def supervise(
             ended.
         restarts: how often a node that was killed is started again; None: never.
         over: for a node that was killed: whether it had done all that the run needs of it.
+        dispensable: whether the run goes on and ends well without a node that fails for good, or
+            that does not end.
 
     Returns:
         Why the run failed; None if it finished or was interrupted.
@@ -112,29 +117,46 @@ def supervise(
             processes.log('stopping: nodes end their slice and save (Ctrl-C again to hurry)')
             processes.stop()
             return _after_stop(processes)
-        failed = _start_again(processes, restarts, over, silence)
+        failed = _start_again(processes, restarts, over, dispensable, silence)
         if failed is not None:
             died = failed.how_it_ended() + restarts.exhausted(failed.name, failed.code)
             return _stop_all(processes, died)
         running = processes.running()
         for node in processes.nodes:
-            if node.code == 0 and (reason := gave_up(node)) is not None:
-                return _stop_all(processes, reason)
+            if node.code == 0 and not node.excused and (reason := gave_up(node)) is not None:
+                if not dispensable(node):
+                    return _stop_all(processes, reason)
+                _excuse(processes, node, reason)
         if not running:
             return None
         if len(processes.nodes) - len(running) > ended:
             ended = len(processes.nodes) - len(running)
             silence.broken()
-        if ended and silence.seconds > deadline:
+        if ended and all(dispensable(node) for node in running):
+            if silence.seconds > min(deadline, LEAVE_DEADLINE):
+                for node in running:
+                    _excuse(processes, node, f'{node.name} did not end with the rest of the run')
+                processes.kill(running)
+        elif ended and silence.seconds > deadline:
             names = ', '.join(node.name for node in running)
             text = f'{names} did not end within {deadline:g} s after the rest of the run'
             return _stop_all(processes, text)
 
 
+def _excuse(processes: Processes, node: Node, reason: str) -> None:
+    node.excused = True
+    processes.log(f'{reason}: the run goes on without it')
+
+
 def _start_again(
-    processes: Processes, restarts: Restarts, over: Callable[[Node], bool], silence: Silence
+    processes: Processes,
+    restarts: Restarts,
+    over: Callable[[Node], bool],
+    dispensable: Callable[[Node], bool],
+    silence: Silence,
 ) -> Node | None:
-    """Start the nodes again that were killed and may be; the first that failed for good, if any.
+    """Start the nodes again that were killed and may be; the first that failed for good and is
+    needed, if any.
 
     Each node is looked at once: of two that are killed together the second may die meanwhile.
     """
@@ -148,6 +170,10 @@ def _start_again(
             processes.log(f'{node.how_it_ended()}: starting it again (number {times})')
             processes.start_again(node)
             silence.broken()
+        elif dispensable(node):
+            _excuse(
+                processes, node, node.how_it_ended() + restarts.exhausted(node.name, node.code)
+            )
         else:
             return node
     return None

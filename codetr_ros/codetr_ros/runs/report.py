@@ -24,6 +24,7 @@ from codetr_ros.runs.document import (
 from codetr_ros.runs.numbers import column
 from codetr_ros.runs.report_origin import FILES, details, origin
 from codetr_ros.runs.report_text import (
+    evaluations_missing,
     learnt,
     recovery_text,
     result_rows,
@@ -158,6 +159,7 @@ def page(summary: RunSummary, picture: bytes, material: Material | None = None) 
     blocks: list[Block] = [
         Heading(title(summary), 1),
         *([Paragraph(summary.failure, bad=True)] if summary.failure else []),
+        *([Paragraph(text, bad=True)] if (text := evaluations_missing(summary)) else []),
         *([Paragraph(text)] if (text := learnt(summary)) else []),
         Picture(picture, 'learning curve'),
         Heading('Result'),

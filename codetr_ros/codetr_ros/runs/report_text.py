@@ -30,6 +30,18 @@ def title(summary: RunSummary) -> str:
     return what + (' (interrupted)' if s.interrupted else '')
 
 
+def evaluations_missing(summary: RunSummary) -> str:
+    """What the evaluations of a run lack, in a sentence; empty if they are complete."""
+    missing, there = summary.evaluations_missing, len(summary.evaluated())
+    if not missing:
+        return ''
+    return (
+        f'{missing} of {missing + there} evaluations are missing or lack episodes: the evaluator '
+        'was killed, or could not keep up. The weights are not affected; `codetr evaluate` '
+        'measures them'
+    )
+
+
 def result_rows(summary: RunSummary) -> list[tuple[str, str]]:
     """The few numbers that people look for first, for the page and the terminal."""
 
@@ -41,8 +53,10 @@ def result_rows(summary: RunSummary) -> list[tuple[str, str]]:
     final, spread = returns(summary.final_true_return, std)
     (random,) = returns(summary.random_true_return)
     after = f' after {last.step} steps' if last else ''
+    lacks = evaluations_missing(summary)
     evaluated = [
         ('score', f'{score(summary.final_score)}{after}'),
+        *([('evaluations', lacks)] if lacks else []),
         ('score of the random policy', score(summary.random_score)),
         ('true return', (final or 'not evaluated') + (f' +- {spread}' if spread else '')),
         ('true return of the random policy', random or 'not evaluated'),

@@ -152,7 +152,14 @@ class RunSummary(Facts):
     phases_planned: int = Field(description='phases that were planned')
     wall_s: float = Field(description='its duration, the start of its processes included [s]')
     steps_per_s: float | None = Field(description='environment steps per second of that time')
-    evaluations: list[Evaluation] = Field(description='in the order of training steps')
+    evaluations: list[Evaluation] = Field(
+        description='in the order of training steps; only those of which every episode is there'
+    )
+    evaluations_missing: int = Field(
+        0,
+        description='evaluations of the steps taken that lack an episode, that of the random '
+        'policy among them: the evaluator was killed, or too slow',
+    )
     random: Evaluation | None = Field(
         description='results of the uniformly random policy; null if it was not evaluated'
     )

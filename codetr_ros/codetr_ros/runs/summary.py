@@ -170,12 +170,29 @@ class Summary:
         self._wall = self.wall_s if wall_s is None else wall_s
 
     def evaluations(self) -> list[Evaluation]:
-        """A row for each evaluation, in order of training steps."""
-        return [results.row(step) for step, results in sorted(self._evaluations.items())]
+        """A row for each evaluation that is whole, in order of training steps."""
+        return [
+            results.row(step)
+            for step, results in sorted(self._evaluations.items())
+            if self._whole(results)
+        ]
 
     def random(self) -> Evaluation | None:
-        """The row of the uniformly random policy; None if it was not evaluated."""
-        return self._random.row(0) if self._random else None
+        """The row of the uniformly random policy; None if it was not evaluated, or in part."""
+        return self._random.row(0) if self._random and self._whole(self._random) else None
+
+    def _whole(self, results: _Results) -> bool:
+        """Whether all episodes of an evaluation are there: of half of them the mean is another."""
+        return len(results.by_episode) >= self.settings.evaluate_episodes
+
+    def _evaluations_missing(self) -> int:
+        """How many evaluations of the committed phases are not there, or not whole."""
+        settings = self.settings
+        if not settings.evaluate_every or not self._phases:
+            return 0
+        there = {row.version for row in self.evaluations()}
+        due = [version for version in range(self._phases) if settings.evaluated(version)]
+        return sum(version not in there for version in due) + (self.random() is None)
 
     @property
     def label_unit(self) -> float | None:
@@ -258,6 +275,7 @@ class Summary:
             wall_s=round(wall, 3),
             steps_per_s=round((self.steps - self._before) / wall, 3) if wall > 0 else None,
             evaluations=evaluations,
+            evaluations_missing=self._evaluations_missing(),
             random=random,
             reward_recovery=self._reward_recovery(),
             label_unit=self.label_unit,
@@ -320,6 +338,8 @@ class Summary:
         if self._random:
             evaluated.append((-1, self._random))
         for version, results in evaluated:
+            if not self._whole(results):
+                continue
             rows[version] |= {f'evaluation.{n}': v for n, v in results.numbers().items()}
             rows[version]['evaluation.episodes'] = len(results.episodes)
         columns = sorted({column for row in rows.values() for column in row})
