@@ -226,7 +226,8 @@ def train(
     notes: list[str] = []
     try:
         if begun is not None:
-            notes = resume.begin(folder, begun, settings)
+            notes = [] if in_process else resume.lengthen(settings, run_id, folder)
+            notes += resume.begin(folder, begun, settings)
             run_folder.forget_reports(folder)
         else:
             run_folder.write_settings(folder, settings)
@@ -235,7 +236,7 @@ def train(
             origin.write(
                 folder, origin.origin(settings, run_id, where, in_process, recorded, command)
             )
-    except OSError as error:
+    except (OSError, RunFolderError) as error:
         return refuse(str(error))
     recorded_before = True if begun is not None else None
     summary = Summary(settings, run_id, in_process, command=command, recorded=recorded_before)

@@ -94,6 +94,40 @@ def take_up(settings: Settings, run_id: str, folder: Path) -> dict[str, NodeRepo
     return driven(prepare(settings, run_id, folder))
 
 
+def lengthen(
+    settings: Settings, run_id: str, folder: Path, log: Callable[[str], None] = _log.warning
+) -> None:
+    """Prepare the folder of a run over topics that goes on with more steps than it began with, if
+    it does: its nodes then restore themselves. The last policy, for example, has permitted nothing
+    more, and is published anew.
+
+    Args:
+        settings: the run's settings; only `steps` may be others than before, and more.
+        run_id: its name.
+        folder: its folder.
+        log: takes what people should know, a line at a time.
+
+    Raises:
+        BagError: the bag is damaged before its last commit, of another run or of other settings.
+        OSError: it cannot be written.
+    """
+    settings, bag = settled(settings), folder / run_folder.BAG
+    before = announced(bag)
+    if before is None:
+        return
+    _check(before, settings, run_id, bag)
+    known = from_canonical(before.settings, str(bag))
+    if known.steps == settings.steps:
+        return
+    commit = _cut(bag, known, settings, log).commit
+    # all that was learnt up to there lies before the commit
+    newest = -1 if commit is None else commit.phase - settings.lag
+    if known.warmup_phases != settings.warmup_phases:
+        newest = -1  # at the end of its warm-up the shorter run has learnt
+    for role in ('reward', 'learner'):
+        checkpoints.remove_after(folder / run_folder.CHECKPOINTS, role, newest)
+
+
 def _check(before: RunSpec, settings: Settings, run_id: str, bag: Path) -> None:
     """Refuse a bag of another run, or of other settings than `steps`."""
     if before.run_id != run_id:

@@ -120,11 +120,13 @@ class Patience:
         waits = [
             f'{peer.who} {peer.presence.doing} ({peer.presence.waiting:.0f} s)' for peer in others
         ]
+        cause = self._peers.cause()
+        who = '; '.join(waits) or 'all others have ended or are silent'
         raise self._because(
-            f'{self._who} gave up after {mine}; nobody is left who could end that: '
-            f'{"; ".join(waits) or "all others have ended or are silent"} ({self._limit}). '
+            f'{self._who} gave up after {mine}; nobody is left who could end that'
+            f'{"" if cause else f": {who}"} ({self._limit}). '
             f'Look for the node that lacks what another has published, and {self._again}',
-            self._peers.cause(),
+            cause,
         )
 
     def _check_silent(self, now: float, waiting: float, doing: str) -> None:

@@ -17,9 +17,9 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from codetr_ros.bags.definitions import encode
+from codetr_ros.bags.definitions import decode_sent, encode, stamp_of
 from codetr_ros.config import Settings
-from codetr_ros.nodes.signing import key_of, signed
+from codetr_ros.nodes.signing import is_signed, key_of, signed
 from codetr_ros.records import TOPICS, Record
 from codetr_ros.records.shown import shown
 from codetr_ros.ros import messages, qos
@@ -142,6 +142,20 @@ class Link:
         if self.key is None:
             return data
         return signed(self.key, self.topic(type(record)), data)
+
+    def is_signed(self, kind: type, data: bytes) -> bool:
+        """Whether a message has the signature that the nodes of this run ask for."""
+        return self.key is None or is_signed(self.key, self.topic(kind), data)
+
+    def signed_again(self, kind: type, data: bytes) -> bytes:
+        """A message of this node's own bag, with the signature that the nodes of this run ask for:
+        a run that goes on has another key than before.
+        """
+        if self.key is None or self.is_signed(kind, data):
+            return data
+        record, sender = decode_sent(kind, data)
+        unsigned = encode(record, stamp_of(data), sender=sender)
+        return signed(self.key, self.topic(kind), unsigned)
 
     def topic(self, record_type: type) -> str:
         """The full name of the topic of a kind of record."""

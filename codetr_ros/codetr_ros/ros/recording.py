@@ -13,11 +13,11 @@ bag; without a bag, the last ones from memory.
 
 import time
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any, cast
 
-from codetr_ros.bags.definitions import decode_sent, encode, stamp_of
+from codetr_ros.bags.definitions import decode, decode_sent, encode, stamp_of
 from codetr_ros.bags.topics import RECORDED, topics_of_run
 from codetr_ros.cores.beside import Beside, Early
 from codetr_ros.cores.recorder import Recorder
@@ -90,9 +90,17 @@ class Recording(Wiring):
         for kind in RECORDED:
             if kind not in (RunSpec, Commit):  # the first has arrived, the second is our own
                 link.subscribe(kind, self.take, settings)
-        PhaseService(link, SERVICE, run_id, bag.read, lambda: bag.newest)
+        PhaseService(link, SERVICE, run_id, self._read, lambda: bag.newest)
         for data in self._commits:  # and by the counts of its presence others know of them
-            link.send(TOPICS[Commit], data)
+            known = link.is_signed(Commit, data)  # else all nodes are new, and take none of ours
+            link.send(TOPICS[Commit], data if known else link.message(decode(Commit, data)))
+
+    def _read(self, phase: int, kinds: Collection[str]) -> Iterable[tuple[type, bytes]]:
+        """The messages of a phase, as the nodes of this run take them."""
+        found = self._bag.read(phase, kinds)
+        if not self._bag.gone_on:
+            return found
+        return ((kind, self.member.link.signed_again(kind, raw)) for kind, raw in found)
 
     def _restore(self, record: Record, data: bytes) -> None:
         """Take a record that the bag holds already."""

@@ -1,0 +1,65 @@
+"""`codetr train --resume` over topics: all processes killed at once, and runs that get longer."""
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS')
+
+from kills import phase_of
+
+from codetr_ros.bags.verify import verify
+from codetr_ros.cores import in_process
+from codetr_ros.runs import origin
+from helpers.builders import tiny
+from helpers.forked import codetr
+from helpers.runs import finish, node_of, start, until, write
+
+ENVIRONMENT = os.environ | {'COLUMNS': '160'}
+SETTINGS = tiny(steps=1600, threads=1, evaluate_every=400)
+
+
+def digests(settings):
+    """The weights of an undisturbed run of these settings."""
+    reports = in_process.run(settings, 'undisturbed')
+    return [reports['learner'].policy_sha256, reports['reward'].reward_model_sha256]
+
+
+def weights(summary):
+    return [summary['policy_sha256'], summary['reward_model_sha256']]
+
+
+def resumed(folder: Path, *flags: str):
+    """Go on with a run to its end; its summary."""
+    flags = ('--resume', str(folder), '--no-film', *flags)
+    return finish(codetr('train', *flags, environment=ENVIRONMENT), folder)[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('overlap', [False, True], ids=['lock-step', 'overlap'])
+def test_a_run_all_of_which_is_killed_goes_on_and_gets_longer_and_has_the_same_weights(
+    tmp_path, overlap
+):
+    settings, folder = SETTINGS.changed({'overlap': overlap}), tmp_path / 'run'
+    command = start(write(settings, folder), folder)
+    until(lambda: phase_of(folder) >= 3, command, folder)
+    nodes = [node_of(folder, path.stem) for path in (folder / 'logs').glob('*.log')]
+    for number in (command.pid, *nodes):
+        os.kill(number, signal.SIGKILL)
+    command.communicate()
+    summary = resumed(folder)
+    assert weights(summary) == digests(settings)
+    assert len(origin.read(folder).resumed) == 1
+    assert verify(folder / 'bag').sound
+    assert summary['evaluations_missing'] == 0
+
+    longer = settings.changed({'steps': 2400})
+    summary = resumed(folder, '--steps', '2400')
+    assert weights(summary) == digests(longer)
+    assert summary['steps'] == 2400
+    assert verify(folder / 'bag').sound
+    assert summary['evaluations_missing'] == 0
+    assert json.loads((folder / 'summary.json').read_text())['settings']['steps'] == 2400
