@@ -4,21 +4,28 @@ The settings that people change most are arguments too: `task:=Hopper-v5 delay:=
 are in a file that `config` names.
 
 The settings of the run decide which nodes it needs. They start in any order and wait for each
-other. The launch ends with the recorder, which is the last node to end. If a node fails, the
-launch ends the others and returns an exit code other than 0. It starts all simulators of the run,
+other. The launch ends with the recorder, which is the last node to end. A node that was killed is
+started again, with a folder of the run so that it goes on; one that has ended by itself is not. If
+a node fails otherwise, the launch ends the others and returns an exit code other than 0; only the
+evaluator may fail, and its results are missing then. The launch starts all simulators of the run,
 unless the argument `start_simulators` is false: then each is started by hand, on any machine and
 with a name of its own, `ros2 run sim_node sim --ros-args -r __ns:=/codetr -r __node:=sim_2`.
 """
 
 import signal
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
 from launch.actions import (
     DeclareLaunchArgument,
     EmitEvent,
+    LogInfo,
     OpaqueFunction,
     RegisterEventHandler,
+    TimerAction,
 )
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
@@ -28,6 +35,7 @@ from launch_ros.actions import Node
 
 from codetr_ros.config import USUAL, Settings, from_text, load
 from codetr_ros.nodes import signing
+from codetr_ros.processes.restarts import MOST, WITHIN, Restarts, wrong
 from codetr_ros.records.roles import TABLE
 from codetr_ros.ros.parameters import FIELDS, as_parameters
 
@@ -41,6 +49,12 @@ ARGUMENTS = {
         '30.0',
         'seconds of silence after which a simulator of several is left out; 0: never',
     ),
+    'restarts': (
+        str(MOST),
+        'how often a node that was killed is started again within restarts_within; 0: never',
+    ),
+    'restarts_within': (f'{WITHIN:g}', 'seconds'),
+    'restart_delay': ('1.0', 'seconds until a node that was killed is started again'),
     'start_simulators': ('true', 'false: simulators are started by hand, on any machine'),
 }
 STOP_DEADLINE = '20'
@@ -50,8 +64,8 @@ writes a checkpoint.
 
 
 class NodeFailedError(RuntimeError):
-    """A node of the run has failed. Of all that a launch file can do, only an error makes `ros2
-    launch` return another exit code than 0.
+    """A node of the run has failed, or an argument is refused. Of all that a launch file can do,
+    only an error makes `ros2 launch` return another exit code than 0.
     """
 
 
@@ -64,9 +78,85 @@ def check(event: ProcessExited, context: LaunchContext) -> None:
     """
     stopped = context.is_shutdown and event.returncode == -signal.SIGINT
     if event.returncode and not stopped:
-        code = event.returncode
-        how = f'ended with exit code {code}' if code > 0 else f'was ended by signal {-code}'
-        raise NodeFailedError(f'{event.process_name} {how}: the run has failed, see its output')
+        raise NodeFailedError(f'{how_it_ended(event)}: the run has failed, see its output')
+
+
+def how_it_ended(event: ProcessExited) -> str:
+    """How a process ended, for people."""
+    code = event.returncode
+    how = f'ended with exit code {code}' if code >= 0 else f'was ended by signal {-code}'
+    return f'{event.process_name} {how}'
+
+
+@dataclass
+class Started:
+    """Starts a process, and again if it was killed.
+
+    Attributes:
+        name: of the node.
+        make: makes the action that starts it.
+        restarts: how often that may be.
+        delay: seconds until then.
+        needed: whether the run fails with it.
+        at_the_end: what happens once it has ended by itself, and well.
+    """
+
+    name: str
+    make: Callable[[], LaunchDescriptionEntity]
+    restarts: Restarts
+    delay: float
+    needed: bool = True
+    at_the_end: list[LaunchDescriptionEntity] = field(default_factory=list)
+
+    def actions(self) -> list[LaunchDescriptionEntity]:
+        """What starts it."""
+        process = self.make()
+        ended = OnProcessExit(target_action=process, on_exit=self.ended)
+        return [RegisterEventHandler(ended), process]
+
+    def ended(
+        self, event: ProcessExited, context: LaunchContext
+    ) -> list[LaunchDescriptionEntity] | None:
+        """What follows once it has ended.
+
+        Raises:
+            NodeFailedError: the run has failed.
+        """
+        code, how = event.returncode, how_it_ended(event)
+        if not context.is_shutdown and self.restarts.permit(self.name, code):
+            again = f'{how}: starting it again (number {self.restarts.counts[self.name]})'
+            return [LogInfo(msg=again), TimerAction(period=self.delay, actions=self.actions())]
+        if code == 0:
+            return self.at_the_end
+        if not self.needed:
+            return [LogInfo(msg=f'{how}: the run goes on without it')]
+        check(event, context)
+        return None
+
+
+def restarts_of(context: LaunchContext) -> tuple[Restarts, float]:
+    """How often a killed node is started again, and after how many seconds.
+
+    Raises:
+        NodeFailedError: an argument is refused.
+    """
+
+    def number(name: str) -> float:
+        text = LaunchConfiguration(name).perform(context)
+        try:
+            return float(text)
+        except ValueError:
+            raise NodeFailedError(f'{name}:={text} must be a number') from None
+
+    most, within, delay = map(number, ('restarts', 'restarts_within', 'restart_delay'))
+    if most != int(most) or not 0 <= delay <= WITHIN:
+        raise NodeFailedError(
+            f'restarts:={most:g} must be a whole number, and restart_delay:={delay:g} from 0 to '
+            f'{WITHIN:g} seconds'
+        )
+    if reason := wrong(int(most), within):
+        raise NodeFailedError(reason)
+    return Restarts(int(most), within), delay
 
 
 def settings_of(context: LaunchContext) -> tuple[Settings, dict[str, Any]]:
@@ -93,8 +183,10 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     if value['start_simulators'].perform(context).lower() == 'true':
         named |= dict.fromkeys(settings.simulator_names, 'sim')
     key = signing.environment()  # that only these nodes have
-    processes = {
-        name: Node(
+    restarts, delay = restarts_of(context)
+
+    def node(name: str, role: str) -> Node:
+        return Node(
             package=TABLE[role].package,
             executable=TABLE[role].executable,
             name=name if role == 'sim' else TABLE[role].executable,
@@ -105,19 +197,20 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             parameters=[shared | own.get(role, {})],
             additional_env=key,
         )
-        for name, role in named.items()
-    }
-    end = RegisterEventHandler(
-        OnProcessExit(
-            target_action=processes['record'],
-            on_exit=[EmitEvent(event=Shutdown(reason='the run is over'))],
+
+    over = EmitEvent(event=Shutdown(reason='the run is over'))
+    processes = [
+        Started(
+            name,
+            partial(node, name, role),
+            restarts,
+            delay,
+            needed=not TABLE[role].dispensable,
+            at_the_end=[over] if role == 'record' else [],
         )
-    )
-    failed = [
-        RegisterEventHandler(OnProcessExit(target_action=process, on_exit=check))
-        for process in processes.values()
+        for name, role in named.items()
     ]
-    return [*failed, end, *processes.values()]
+    return [action for process in processes for action in process.actions()]
 
 
 def generate_launch_description() -> LaunchDescription:

@@ -128,3 +128,68 @@ def test_a_node_that_fails_ends_the_launch_with_another_exit_code_than_0(module,
         LaunchDescription([RegisterEventHandler(failed), RegisterEventHandler(ends), node, other])
     )
     assert service.run() == (failure is not None)
+
+
+COUNTED = """
+import os, sys
+with open(sys.argv[1], 'a') as file:
+    file.write('started\\n')
+with open(sys.argv[1]) as file:
+    times = len(file.readlines())
+"""
+
+
+@pytest.mark.parametrize(
+    ('program', 'most', 'starts', 'fails'),
+    [
+        ('if times < 3: os.kill(os.getpid(), 9)', 5, 3, False),
+        ('os.kill(os.getpid(), 9)', 2, 3, True),
+        ('os.kill(os.getpid(), 9)', 0, 1, True),
+        ('', 5, 1, False),
+        ('sys.exit(3)', 5, 1, True),
+    ],
+    ids=['is killed twice', 'is killed too often', 'never again', 'ends well', 'gives a reason'],
+)
+def test_a_node_is_started_again_only_if_it_was_killed(
+    module, tmp_path, program, most, starts, fails
+):
+    file = tmp_path / 'starts'
+    made = []
+
+    def make():
+        made.append(
+            ExecuteProcess(cmd=[sys.executable, '-c', COUNTED + program, str(file)], name='sim')
+        )
+        return made[-1]
+
+    other = ExecuteProcess(cmd=[sys.executable, '-c', 'import time; time.sleep(600)'])
+    over = [EmitEvent(event=Shutdown())]
+    node = module.Started('sim', make, module.Restarts(most), 0.01, at_the_end=over)
+    service = LaunchService(noninteractive=True)
+    service.include_launch_description(LaunchDescription([*node.actions(), other]))
+    assert bool(service.run()) == fails
+    assert len(file.read_text().splitlines()) == len(made) == starts
+
+
+def test_an_evaluator_that_fails_does_not_end_the_launch(module):
+    failing = ExecuteProcess(cmd=[sys.executable, '-c', 'raise SystemExit(3)'], name='evaluate')
+    after = [EmitEvent(event=Shutdown())]
+    last = ExecuteProcess(cmd=[sys.executable, '-c', 'import time; time.sleep(1)'], name='record')
+    restarts = module.Restarts(0)
+    nodes = [
+        module.Started('evaluate', lambda: failing, restarts, 0.0, needed=False),
+        module.Started('record', lambda: last, restarts, 0.0, at_the_end=after),
+    ]
+    service = LaunchService(noninteractive=True)
+    actions = [action for node in nodes for action in node.actions()]
+    service.include_launch_description(LaunchDescription(actions))
+    assert service.run() == 0
+
+
+@pytest.mark.parametrize(
+    'given', [{'restarts': '-1'}, {'restarts': '1.5'}, {'restart_delay': 'soon'}]
+)
+def test_numbers_of_restarts_that_cannot_be_are_refused(started, module, given):
+    (name,) = given
+    with pytest.raises(RuntimeError, match=name):
+        started(**given)

@@ -88,7 +88,7 @@ class Patience:
         lacking = ', '.join(f'{n} of {topic!r}' for topic, n in sorted(lost.items()))
         never = f'messages that were published never reached it: {lacking}' if lost else ''
         working = [peer for peer in self._others(now) if not peer.presence.waiting]
-        if self._outside or working:
+        if self._outside or working or not self._peers.by_instance:
             if lost:
                 raise NodeError(
                     f'{self._who} gave up after {waiting:.0f} s: it {doing}, and {never} '
