@@ -33,12 +33,15 @@ class Waiter(Protocol):
         """Give ROS its turn, and block at most `wait` seconds for something to arrive."""
 
 
-def wait_for(member: Waiter, lacks: Callable[[], Sequence[str]]) -> bool:
+def wait_for(
+    member: Waiter, lacks: Callable[[], Sequence[str]], cause: Callable[[], str] = lambda: ''
+) -> bool:
     """Wait until nothing is lacking, and log what still is. False if asked to stop meanwhile.
 
     Args:
         member: the node that waits.
         lacks: returns what is lacking now, in words.
+        cause: returns why another node has given up, if that is known, else an empty text.
 
     Raises:
         NodeError: the same things were lacking for longer than the parameter `peer_deadline`.
@@ -58,7 +61,7 @@ def wait_for(member: Waiter, lacks: Callable[[], Sequence[str]]) -> bool:
             raise NodeError(
                 f'{member.link.full_name} gave up after {member.deadline:g} s: it {doing}. '
                 f'A larger {member.deadline_is} makes it wait longer',
-                member.peers.cause(),
+                cause(),
             )
         if now - named >= NAME_EVERY:
             named = now

@@ -206,7 +206,7 @@ def _known(member: Membership) -> RunSpec | None:
             ]
         return [f'the learner, which announces {wanted} on {topic!r} ({remedy})']
 
-    return member.run if wait_for(member, lacking) else None
+    return member.run if wait_for(member, lacking, member.peers.cause) else None
 
 
 def _outside(member: Membership, run: RunSpec) -> str:

@@ -82,7 +82,9 @@ class Node:
 
     def _gather(self, wiring: Wiring) -> bool:
         """Wait until all peers are present and matched. False if asked to stop meanwhile."""
-        if not (wiring.complete() and wait_for(self.member, wiring.lacking)):
+        if not (
+            wiring.complete() and wait_for(self.member, wiring.lacking, self.member.peers.cause)
+        ):
             return False
         self.member.begun = True
         self._log.info('everybody is there')

@@ -57,7 +57,7 @@ class _Recorder:
             return [] if answers else [f'the answer of {self._asker.service!r}']
 
         lacking()
-        if not wait_for(self._member, lacking):
+        if not wait_for(self._member, lacking, self._member.peers.cause):
             raise _StoppedError
         answer = answers[0]
         if answer.reason:

@@ -56,7 +56,6 @@ def result_rows(summary: RunSummary) -> list[tuple[str, str]]:
     lacks = evaluations_missing(summary)
     evaluated = [
         ('score', f'{score(summary.final_score)}{after}'),
-        *([('evaluations', lacks)] if lacks else []),
         ('score of the random policy', score(summary.random_score)),
         ('true return', (final or 'not evaluated') + (f' +- {spread}' if spread else '')),
         ('true return of the random policy', random or 'not evaluated'),
@@ -65,6 +64,7 @@ def result_rows(summary: RunSummary) -> list[tuple[str, str]]:
     ]
     return [
         *(evaluated if summary.evaluated() else [('evaluation', NOT_EVALUATED)]),
+        *([('evaluations', lacks)] if lacks else []),
         *_given(summary.scores_given),
         ('steps', f'{summary.steps} of {summary.steps_planned}'),
         ('phases', f'{summary.phases} of {summary.phases_planned}'),
