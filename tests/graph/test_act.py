@@ -34,6 +34,7 @@ def test_it_drives_the_arm_at_its_rate_within_its_limits_and_obeys_silence_and_p
         person.ticks(40)
         assert 1.8 < time.monotonic() - began < 4.0  # two seconds at 20 Hz
         assert person.moves()
+        assert 'libtorch' not in run.mapped('robot')
         commands = np.array(person.commands)
         assert (np.abs(commands) <= 0.8).all()
         assert (np.abs(np.diff(commands, axis=0)) <= 4.0 / 20 + 1e-9).all()

@@ -58,3 +58,8 @@ class ActRun(RobotRun):
         """What a node has logged."""
         path = self.folder / run_folder.LOGS / f'{name}.log'
         return path.read_text() if path.exists() else ''
+
+    def mapped(self, name: str) -> str:
+        """The files that a process has mapped into its memory, its libraries among them."""
+        (node,) = [node for node in self._processes.nodes if node.name == name]
+        return Path(f'/proc/{node.process.pid}/maps').read_text()

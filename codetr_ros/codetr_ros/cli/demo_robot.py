@@ -12,7 +12,7 @@ from typing import Annotated
 import tyro
 
 from codetr_ros import config
-from codetr_ros.cli import FAILED, demo_run, refuse
+from codetr_ros.cli import FAILED, demo_run, export, refuse
 from codetr_ros.cli.terminal import console, parse_arguments
 from codetr_ros.config import Settings, SettingsError
 from codetr_ros.processes import launcher
@@ -137,4 +137,5 @@ def _show(settings: Settings, folder: Path) -> int:
     for name, value in outcome.items():
         shown.print(f'{name}: {value}', markup=False)
     shown.print(f'{folder / PAGE}, by phase: {folder / SCORES}', markup=False)
+    shown.print(export.after_a_run(folder), markup=False)
     return 0

@@ -1,6 +1,8 @@
 """`codetr export`: write the policy of a run into a file, to act on its robot without the run."""
 
 import dataclasses
+import shutil
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +14,7 @@ from codetr_ros.cli import refuse
 from codetr_ros.cli.evaluate import newest_policy, settings_here
 from codetr_ros.cli.terminal import console, parse_arguments
 from codetr_ros.config import SettingsError
+from codetr_ros.nodes.errors import explains_itself
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import origin
 from codetr_ros.runs.folder import RunFolderError
@@ -62,37 +65,57 @@ def main(arguments: Sequence[str]) -> int:
     if path.is_dir():
         return refuse(f'--out {given.out} is a folder: name a file, such as {path}/policy')
     try:
-        settings = settings_here(folder)
+        settings_here(folder)  # before torch is imported
         check_makeable(path.parent)
     except (RunFolderError, SettingsError, FileError) as error:
         return refuse(str(error))
-    from codetr_ros.learners.base import LearnerError
-    from codetr_ros.policy.network import NetworkError
-    from codetr_ros.robots.policy_export import export
-    from codetr_ros.robots.policy_file import PolicyFileError
-    from codetr_ros.robots.same_robot import AnotherRobotError
-    from codetr_ros.runs.checkpoints import CheckpointError
-
     try:
-        robot = _robot(folder, given)
-        policy = replace(newest_policy(folder, settings), run_id=origin.read(folder).run_id)
-        make_folder(path.parent)
-        made = export(policy, robot, run_folder.read_settings(folder), path)
-    except (
-        RunFolderError,
-        CheckpointError,
-        LearnerError,
-        SettingsError,
-        NetworkError,
-        PolicyFileError,
-        AnotherRobotError,
-    ) as error:
+        made = make(folder, path, given.mapping, given.robot)
+    except ValueError as error:
+        if not explains_itself(error):
+            raise
         return refuse(str(error))
     _show(made, path)
     return 0
 
 
-def _robot(folder: Path, given: Arguments) -> 'RobotFacts':
+def after_a_run(folder: Path) -> str:
+    """Export the policy of a run on a robot that has just ended; what came of it, in words."""
+    path = folder / run_folder.POLICY
+    try:
+        make(folder, path)
+    except ValueError as error:
+        if not explains_itself(error):
+            raise
+        return f'the policy was not exported: {error}'
+    return f'the policy, to act by without the run: {_command(path)}'
+
+
+def make(
+    folder: Path, path: Path, mapping: str | None = None, robot: str | None = None
+) -> 'PolicyFile':
+    """Write the policy of a run's newest checkpoint into a file, and test the file.
+
+    Args:
+        folder: of the run.
+        path: the file.
+        mapping: the mapping of the robot; None: the one in the folder.
+        robot: which robot, of several.
+
+    Raises:
+        ValueError: one that explains itself: the run, its checkpoint or the robot cannot be used.
+        OSError: the file cannot be written.
+    """
+    from codetr_ros.robots.policy_export import export
+
+    settings = settings_here(folder)
+    known = _robot(folder, mapping, robot)
+    policy = replace(newest_policy(folder, settings), run_id=origin.read(folder).run_id)
+    make_folder(path.parent)
+    return export(policy, known, run_folder.read_settings(folder), path)
+
+
+def _robot(folder: Path, given: str | None, name: str | None) -> 'RobotFacts':
     """The robot of a run, from its folder or the mapping that was given.
 
     Raises:
@@ -103,13 +126,13 @@ def _robot(folder: Path, given: Arguments) -> 'RobotFacts':
     from codetr_ros.robots import mapping, robot_facts
     from codetr_ros.robots.same_robot import check_mapping
 
-    if given.mapping is None:
-        return robot_facts.read(folder, given.robot)
-    rules = mapping.load(Path(given.mapping))
+    if given is None:
+        return robot_facts.read(folder, name)
+    rules = mapping.load(Path(given))
     if not (folder / run_folder.ROBOTS).is_dir():
         return robot_facts.RobotFacts(mapping=rules, types={}, sizes=())
-    there = robot_facts.read(folder, given.robot)
-    check_mapping(there.mapping, rules, given.mapping, f'the policy in {folder}', False)
+    there = robot_facts.read(folder, name)
+    check_mapping(there.mapping, rules, given, f'the policy in {folder}', False)
     return there.model_copy(update={'mapping': rules})
 
 
@@ -146,4 +169,12 @@ def _show(made: 'PolicyFile', path: Path) -> None:
     shown = console()
     for name, text in rows.items():
         shown.print(f'{name:<12}{text}')
-    shown.print(f'\nros2 run learner_node act --ros-args -p checkpoint:={path}')
+    shown.print(f'\n{_command(path)}')
+
+
+def _command(path: Path) -> str:
+    """What acts by a policy file. An installation from wheels has no `ros2`."""
+    program = 'ros2 run learner_node act'
+    if shutil.which('ros2') is None:
+        program = f'{sys.executable} -m learner_node.act'
+    return f'{program} --ros-args -p checkpoint:={path}'
