@@ -12,7 +12,7 @@ from codetr_ros.cli import export
 from codetr_ros.learners import registry
 from codetr_ros.policy.acting import ActingPolicy
 from codetr_ros.robots import policy_file, robot_facts
-from codetr_ros.runs import checkpoints, origin
+from codetr_ros.runs import checkpoints
 from codetr_ros.runs import folder as run_folder
 from helpers import policies
 from helpers.builders import tiny
@@ -29,7 +29,6 @@ def run(tmp_path: Path) -> Path:
     folder = tmp_path / 'run'
     folder.mkdir()
     run_folder.write_settings(folder, SETTINGS)
-    origin.write(folder, origin.origin(SETTINGS, 'r1', '/r', False, True, None))
     robot_facts.write(folder, 'robot', policies.facts())
     save(folder, SETTINGS.warmup_phases)
     return folder
@@ -37,7 +36,7 @@ def run(tmp_path: Path) -> Path:
 
 def save(folder: Path, phase: int) -> None:
     learner = registry.make(SETTINGS.changed({'seed': phase}), 4, 2)
-    meta = {'observation_size': 4, 'action_size': 2}
+    meta = {'run_id': 'r1', 'observation_size': 4, 'action_size': 2}
     checkpoints.save(folder / 'checkpoints', 'learner', phase, learner.state(), meta)
 
 

@@ -61,6 +61,7 @@ def test_it_drives_the_arm_at_its_rate_within_its_limits_and_obeys_silence_and_p
         assert not any(person.commands[-1])
         assert run.codes()['robot'] == 0
         assert 'commands changed by limit change' in run.log('robot')
+        assert 'control deadlines missed' in run.log('robot')
         assert 'control steps were late by' in run.log('robot')
 
 

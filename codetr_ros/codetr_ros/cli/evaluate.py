@@ -171,7 +171,7 @@ def newest_policy(folder: Path, settings: Settings, place: Path | None = None) -
     except LearnerError as error:
         raise LearnerError(f'checkpoint {path}: {error}') from None
     return Policy(
-        run_id='evaluate',
+        run_id=str(meta.get('run_id', 'evaluate')),
         phase=phase + settings.lag,
         version=phase,
         sources=(),

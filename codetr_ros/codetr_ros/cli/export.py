@@ -4,7 +4,6 @@ import dataclasses
 import shutil
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,7 +15,6 @@ from codetr_ros.cli.terminal import console, parse_arguments
 from codetr_ros.config import SettingsError
 from codetr_ros.nodes.errors import explains_itself
 from codetr_ros.runs import folder as run_folder
-from codetr_ros.runs import origin
 from codetr_ros.runs.folder import RunFolderError
 from codetr_ros.system.files import FileError, check_makeable, make_folder
 
@@ -110,7 +108,7 @@ def make(
 
     settings = settings_here(folder)
     known = _robot(folder, mapping, robot)
-    policy = replace(newest_policy(folder, settings), run_id=origin.read(folder).run_id)
+    policy = newest_policy(folder, settings)
     make_folder(path.parent)
     return export(policy, known, run_folder.read_settings(folder), path)
 

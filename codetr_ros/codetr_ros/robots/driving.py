@@ -21,6 +21,7 @@ from codetr_ros.robots.reset import Resetting
 from codetr_ros.robots.senses import Senses
 from codetr_ros.robots.steplog import StepLog
 
+MISSED = 'control deadlines missed'
 BACK = 0.1  # [s] by which a clock must go back to have been set back
 
 
@@ -188,6 +189,6 @@ class Driving:
         counters = self.control.counts + self.senses.counts + self._counters
         whole = {name: round(value) for name, value in self.deadlines.metrics().items()}
         counters['control steps'] = whole['control_steps']
-        counters['control deadlines missed'] = whole['deadlines_missed']
+        counters[MISSED] = whole['deadlines_missed']
         counters['resets that failed'] = self.control.reset.failures
         return counters

@@ -17,7 +17,7 @@ from codetr_ros.nodes import errors
 from codetr_ros.nodes.errors import NodeError
 from codetr_ros.robots import mapping, policy_file
 from codetr_ros.robots.acting import driving
-from codetr_ros.robots.driving import Driving
+from codetr_ros.robots.driving import MISSED, Driving
 from codetr_ros.robots.mapping import Mapping
 from codetr_ros.robots.policy_file import PolicyFile
 from codetr_ros.robots.same_robot import AnotherRobotError, check_mapping, check_sizes, check_types
@@ -205,10 +205,10 @@ class Act:
             code = 1
             self.log.fatal(f'at the end: {traceback.format_exc()}')
         if self._driving is not None:
-            counts = {name: n for name, n in sorted(self._driving.counts().items()) if n}
+            counts = {n: c for n, c in sorted(self._driving.counts().items()) if c or n == MISSED}
             late = self._driving.deadlines.metrics()
             self.log.info(
-                ', '.join(f'{n} {name}' for name, n in counts.items())
+                ', '.join(f'{count} {name}' for name, count in counts.items())
                 + f'; control steps were late by {late["late_ms_p50"]:.2f} ms (half of them), '
                 f'{late["late_ms_p99"]:.2f} ms (99 %), {late["late_ms_max"]:.2f} ms (the latest)'
             )
