@@ -38,7 +38,7 @@ PERIOD = 0.02  # [s] between two measurements
 PATIENCE = 0.3  # [s] without a command, after which the motors stop
 RESETTING = 0.25  # [s] that a reset takes
 SCORED = 1.0  # [s] of movement that a score is of
-SHORTEST = 0.9  # [s] of it that the last score of an attempt is of, at the least
+SHORTEST = 0.7  # [s] of it that the last score of an attempt is of, at the least
 
 
 class StandIn(Node):

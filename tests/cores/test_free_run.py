@@ -12,6 +12,7 @@ from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.verify import verify
 from codetr_ros.cores.labeller import Labeller
 from codetr_ros.cores.learner import Learner
+from codetr_ros.offline.replay import replay
 from codetr_ros.offline.robot_report import faults, robot_page
 from codetr_ros.offline.score_course import score_course
 from codetr_ros.records import Commit, CompositeReward, Policy, RunSpec, StepRewards, Transitions
@@ -130,3 +131,24 @@ def test_the_page_on_a_robot_shows_scores_control_and_faults(a_free_run, tmp_pat
     assert 'a &lt;robot&gt;' in page and 'joint stuck' in page and 'data:image/png' in page
     assert 'control deadlines missed' in page and 'attempt' not in page
     assert 'left no report' in robot_page('r', course, {}, 2, None, {})
+
+
+def test_labels_that_the_bag_has_phases_later_are_compared_when_it_is_replayed(
+    a_free_run, tmp_path
+):
+    """A recorder that was killed asks for them once more; the robot goes on meanwhile."""
+    records: list = []
+    later: list = []
+    for record in a_free_run.records:
+        if isinstance(record, StepRewards):
+            later.append(record)
+            continue
+        records.append(record)
+        if isinstance(record, Commit):
+            due = [each for each in later if each.phase <= record.phase - 4]
+            records += due
+            later = [each for each in later if each.phase > record.phase - 4]
+    bag = write(tmp_path / 'bag', records + later)
+    made = replay(Bag(bag))
+    assert made.same['labels'] > 0
+    assert not made.differences

@@ -145,14 +145,15 @@ def test_scores_that_a_robot_gives_itself_join_the_next_commit_like_those_of_any
 
 def test_labels_of_a_free_run_that_overtake_those_of_a_phase_before_come_early():
     """A recorder that was killed gets the newest at once, and has to ask for those before."""
-    r = recorder(task='robot/arm', pace='free', evaluate_every=0, scorer='topic')
+    warmup = {'warmup_steps': 400}  # two phases: nobody labels the first
+    r = recorder(task='robot/arm', pace='free', evaluate_every=0, scorer='topic', **warmup)
     work = r.work()
     made = []
-    for phase in range(2):
+    for phase in range(3):
         steps = {'first_step': 200 * phase, 'steps': 200, 'phase_end': True}
         r.receive(transitions(sequence=phase, phase=phase, **steps))
         made += commits(r, work)
-    first, second = (step_rewards(phase=n, commit=digest(made[n])) for n in range(2))
+    first, second = (step_rewards(phase=n, commit=digest(made[n])) for n in (1, 2))
     assert r.comes_early(second) and not r.comes_early(first)
     r.receive(first)
     assert not r.comes_early(second)

@@ -7,7 +7,7 @@ import pytest
 from codetr_ros import cli
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.verify import verify
-from codetr_ros.records import CompositeReward, Transitions
+from codetr_ros.records import CompositeReward, StepRewards, Transitions
 from codetr_ros.runs import folder as run_folder
 from helpers import nodes
 from helpers.robot_runs import Person, RobotRun, robot_settings
@@ -48,4 +48,7 @@ def test_a_run_ends_well_and_is_replayed_though_its_robot_node_and_its_recorder_
     assert [chunk.sequence for chunk in chunks] == list(range(len(chunks)))
     own = [r.sequence for r in records if isinstance(r, CompositeReward) and r.scorer == 'robot']
     assert own == list(range(len(own))) and len(own) > 3
+    labelled = [record.phase for record in records if isinstance(record, StepRewards)]
+    assert labelled == sorted(labelled)
+    assert set(labelled) == set(range(settings.first_labelled, settings.phases))
     assert cli.main(['replay', str(folder), '--verify']) == 0

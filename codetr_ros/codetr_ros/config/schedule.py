@@ -63,14 +63,22 @@ class Schedule:
         """Phases by which a source may be ahead of the newest that was learnt from."""
         return FREE_AHEAD if self.free else self.lag
 
+    @property
+    def first_labelled(self) -> int:
+        """The first phase whose steps are labelled: the last of the warm-up. Each one since is."""
+        return max(0, self.warmup_phases - 1)
+
     def labels_named(self, phase: int) -> int | None:
         """The phase whose labels the commit of a phase names: those that the learner had learnt
         from when it permitted the phase. None where there are none: in the warm-up, where nobody
         labels steps, and at a free pace, where nothing is permitted.
         """
         before = phase - self.lag
-        first = max(0, self.warmup_phases - 1)
-        return before if before >= first and self.labels_steps and not self.free else None
+        return (
+            before
+            if before >= self.first_labelled and self.labels_steps and not self.free
+            else None
+        )
 
     def steps_of(self, phase: int) -> int:
         """Environment steps of a phase, all sources together; 0 beyond the last."""

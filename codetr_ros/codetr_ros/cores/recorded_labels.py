@@ -25,7 +25,7 @@ class RecordedLabels:
         self._restored: dict[tuple[int, int], StepRewards] = {}  # what a bag has of them
         self._last: tuple[StepRewards, StepRewards] | None = None  # taken, and what is kept of it
         self._lacks: dict[int, set[int]] = {}  # parts that are still to come, by phase
-        self.due = 0
+        self.due = settings.first_labelled
         """The first phase whose labels are not all there."""
 
     @property

@@ -168,8 +168,9 @@ class _Steps:
                 if self._sides[name].missing is not None:
                     self._stop(phase, self._sides[name].doubt, path)
         self._replayed.phases = phase + 1
-        lag = self._replayed.recorded.settings.lag
-        self._labels = {key: one for key, one in self._labels.items() if key[0] >= phase - lag}
+        # a robot that goes on may be so many phases ahead of the labels that its bag has
+        ahead = self._replayed.recorded.settings.ahead
+        self._labels = {key: one for key, one in self._labels.items() if key[0] >= phase - ahead}
         self._check(phase)
 
     def _stop(self, phase: int, doubt: str, path: Path) -> None:
