@@ -1,14 +1,12 @@
 """Which sources are silent, so that a phase need not wait for them."""
 
 from codetr_ros.config import Settings
+from codetr_ros.nodes.attention import Attention
 from codetr_ros.nodes.peers import Peer, Peers
 
 LEAVE_OUT_AFTER = 30.0
 """Seconds of silence after which a source is left out, unless the user says otherwise: a node that
 was killed is started again before, and nobody has given up yet."""
-AWAY = 2.0
-"""Seconds between two looks, after which the one who looks was away himself: held, or busy. What
-came meanwhile has not been read, so that silence is counted from then on."""
 
 
 class Silence:
@@ -24,8 +22,8 @@ class Silence:
         self._peers = peers
         self._settings = settings
         self.after = after
-        self._looked = float('-inf')
-        self._since = float('-inf')  # from when on silence counts
+        self._attention = Attention()
+        self._since: float | None = None  # from when on silence counts
 
     def sources(self, now: float) -> dict[str, float]:
         """The sources of simulators that are silent or have ended, and for how long [s].
@@ -34,11 +32,10 @@ class Silence:
         with, and at a free pace nobody is permitted anything.
 
         Args:
-            now: monotonic time [s]. Call it often: see `AWAY`.
+            now: monotonic time [s]. Call it often: see `Attention`.
         """
-        if now - self._looked > AWAY:
+        if self._since is None or self._attention.was_away(now):
             self._since = now
-        self._looked = now
         settings = self._settings
         if not self.after or settings.free or settings.simulators == 1:
             return {}
@@ -51,4 +48,5 @@ class Silence:
 
     def silent(self, peer: Peer, now: float) -> bool:
         """Whether nothing has come from a node for longer than it may be silent."""
-        return 0 < self.after < now - max(peer.received_at, self._since)
+        since = peer.received_at if self._since is None else max(peer.received_at, self._since)
+        return 0 < self.after < now - since

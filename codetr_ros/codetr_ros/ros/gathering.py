@@ -5,6 +5,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, Protocol
 
 from codetr_ros.config import Settings
+from codetr_ros.nodes.attention import Attention
 from codetr_ros.nodes.errors import NodeError
 from codetr_ros.nodes.patience import NAME_EVERY
 from codetr_ros.records.roles import WRITERS, published_by, readers
@@ -47,6 +48,7 @@ def wait_for(
         NodeError: the same things were lacking for longer than the parameter `peer_deadline`.
     """
     began = named = time.monotonic()
+    attention = Attention()
     while not member.stop:
         member.turn(IDLE)
         lacking = lacks()
@@ -54,7 +56,10 @@ def wait_for(
             return True
         now = time.monotonic()
         doing = f'waits for {"; ".join(lacking)}'
-        if doing != member.doing:  # a node arrived: the deadline starts anew for the others
+        away = attention.was_away(now)
+        if (
+            away or doing != member.doing
+        ):  # a node arrived: the deadline starts anew for the others
             member.doing, member.waits_since = doing, now
             began = named = now
         if member.deadline and now - began > member.deadline:

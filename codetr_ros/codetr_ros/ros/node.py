@@ -20,6 +20,7 @@ from functools import partial
 from typing import Any
 
 from codetr_ros.nodes import errors
+from codetr_ros.nodes.attention import Attention
 from codetr_ros.records import TOPICS
 from codetr_ros.ros import joining
 from codetr_ros.ros.gathering import IDLE, wait_for
@@ -94,6 +95,7 @@ class Node:
         member, core = self.member, wiring.joined.core
         work = core.work()
         patience = member.patience([TOPICS[kind] for kind in core.subscribes])
+        attention = Attention()
         waiting: float | None = None  # since when
         worked = False  # the core has yielded something
         while not member.stop:
@@ -108,10 +110,14 @@ class Node:
             self._sound = True
             wiring.show(given or (), member.doing)
             if given is not None:
+                attention.was_away(time.monotonic())  # a slice may take long
                 worked, waiting = True, None
                 member.doing, member.waits_since = 'works', None
                 continue
             now = time.monotonic()
+            if (away := attention.was_away(now)) and waiting is not None:
+                self._log.warning(f'was held for {away:.0f} s, in which it read nothing')
+                waiting = None
             waiting = now if waiting is None else waiting
             if core.finished:
                 member.doing, member.waits_since = 'has finished', waiting

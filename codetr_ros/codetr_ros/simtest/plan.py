@@ -180,7 +180,9 @@ def plan(seed: int) -> Plan:
         and all(each.seconds <= LEASE for each in partitions)
         and silent < DEADLINE / 2
     )
-    return Plan(seed, settings, weather, paces, disk, heals)
+    # drawn last: what a seed drew before stays as it was
+    leave_out_after = rng.choice((0.0, 3.0, 12.0)) if settings.simulators > 1 else 0.0
+    return Plan(seed, settings, weather, paces, disk, heals, leave_out_after)
 
 
 class _Drawn:

@@ -1,0 +1,73 @@
+"""A simulator that receives policies of phases which, as far as it knows, cannot have begun."""
+
+import logging
+
+import numpy as np
+import pytest
+
+from codetr_ros.cores.simulator import Simulator
+from codetr_ros.nodes.behind import MOST, Behind
+from codetr_ros.nodes.traffic import Traffic
+from helpers.builders import policy, run, tiny
+
+BOTH = ('sim', 'sim_2')
+SETTINGS = tiny(simulators=2, steps=20_000, warmup_steps=20_000)
+
+
+def permission(phase):
+    return policy(phase=phase, sources=BOTH, steps=np.array([100, 100], np.uint32))
+
+
+@pytest.fixture
+def simulator():
+    def make(settings=SETTINGS):
+        core = Simulator(run(settings), settings, 'sim_2')
+        traffic = Traffic(logging.getLogger())
+        traffic.core, traffic.settings = core, settings
+        return core, traffic, Behind(traffic, core, settings)
+
+    return make
+
+
+def test_it_goes_on_behind_what_is_committed_without_it(simulator):
+    core, traffic, behind = simulator()
+    for phase in range(3, 8):
+        traffic.receive(permission(phase))
+    assert behind.asks
+    behind.answered(5)
+    assert (core.due, core.displaced, behind.asks) == (6, True, False)
+    assert not traffic.refused
+    traffic.receive(permission(7))  # it has that one
+    assert core.duplicated == {'policy': 1}
+
+
+def test_policies_that_nobody_can_have_published_yet_are_refused(simulator):
+    core, traffic, behind = simulator()
+    traffic.receive(permission(50))
+    assert behind.asks
+    behind.answered(None)
+    assert (core.due, behind.asks, dict(traffic.refused)) == (0, False, {'policy': 1})
+
+
+def test_nothing_is_asked_while_the_next_policy_is_there(simulator):
+    _, traffic, behind = simulator()
+    traffic.receive(permission(5))
+    traffic.receive(permission(0))
+    assert not behind.asks
+
+
+def test_no_more_are_held_than_that(simulator):
+    core, traffic, behind = simulator()
+    for phase in range(2, 2 + MOST + 5):
+        traffic.receive(permission(phase))
+    behind.answered(3)
+    assert core.due == 4
+    assert core.lacks_permission  # the oldest were let go
+
+
+def test_without_another_simulator_they_are_refused_at_once(simulator):
+    _, traffic, behind = simulator(SETTINGS.changed({'simulators': 1}))
+    one = policy(phase=9, sources=('sim_2',), steps=np.array([200], np.uint32))
+    traffic.receive(one)
+    assert not behind.asks
+    assert dict(traffic.refused) == {'policy': 1}
