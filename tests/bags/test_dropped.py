@@ -13,6 +13,7 @@ from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.topics import RECORDED, topics_of_run
 from codetr_ros.bags.verify import verify
 from codetr_ros.bags.writer import McapWriter
+from codetr_ros.cores.recorder import Recorder
 from codetr_ros.records import TOPICS, Commit, Transitions, TrueRewards
 from codetr_ros.simtest.replay import replayed
 from helpers.leaving import bag_with_dropped_steps
@@ -151,3 +152,11 @@ def test_topics_in_any_order_are_brought_into_one_that_the_run_can_have_had(made
         elif isinstance(record, Commit):
             for name, last in zip(record.sources, record.transitions.tolist(), strict=True):
                 assert name in record.dropped or number[name] >= last
+
+
+def test_a_recorder_that_goes_on_with_the_bag_commits_the_same_again(made, recorded):
+    settings = made[1].plan.settings
+    core = Recorder(settings.run_spec('simtest'), settings, 'record')
+    for record in recorded:
+        core.restore(record)
+    assert core.phase == settings.phases
