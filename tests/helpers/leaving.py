@@ -1,6 +1,7 @@
 """Simulated runs whose simulators fall silent, are left out and join again."""
 
 import logging
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,22 +17,33 @@ TWO = next(i for i, each in enumerate(all_settings()) if each.simulators == 2)
 FOUR = next(i for i, each in enumerate(all_settings()) if each.simulators == 4)
 
 
-def leaving(seed: int, stalls: dict[str, list[tuple[float, float]]], slow: str = '') -> Plan:
+def leaving(
+    seed: int,
+    stalls: dict[str, list[tuple[float, float]]],
+    slow: str = '',
+    joiners: tuple[str, ...] = (),
+    begins: Mapping[str, float] | None = None,
+) -> Plan:
     """A run of many phases whose learner takes its time, and whose simulators stall.
 
     Args:
         seed: of the plan.
         stalls: from when and for how long simulators take no turn, by name [s].
         slow: a simulator that takes so long for a chunk that it stalls within a phase.
+        joiners: names of simulators that need not be there at the start.
+        begins: when they start [s].
     """
     planned = plan(seed)
-    settings = planned.settings.changed({'steps': 80, 'evaluate_every': 0, 'delay': 3})
+    settings = planned.settings.changed(
+        {'steps': 80, 'evaluate_every': 0, 'delay': 3, 'joiners': joiners}
+    )
     paces = {name: Pace(slice_seconds=0.02) for name in planned.paces}
     paces['learner'] = Pace(slice_seconds=1.0)
     paces |= {
         name: Pace(slice_seconds=0.2 if name == slow else 0.02, stalls=list(each))
         for name, each in stalls.items()
     }
+    paces |= {name: Pace(begins=at) for name, at in (begins or {}).items()}
     weather = Weather(delay=0.01, reorder=True, doubled=0.1)
     return replace(
         planned,

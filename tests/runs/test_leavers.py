@@ -28,7 +28,7 @@ def test_phases_are_counted_once_however_often_and_late_their_commits_come():
     leavers = Leavers()
     zero, one, two, three = commits()
     assert leavers.receive(zero) == []
-    assert leavers.receive(two) == ['sim_2 is left out from phase 2 on: nothing comes from it']
+    assert leavers.receive(two) == ['sim_2 is left out from phase 2 on: it is not there']
     assert leavers.now() == 'sim_2 (since phase 2)'
     assert leavers.receive(one) == leavers.receive(two) == []
     assert leavers.receive(three) == ['sim_2 is there again']

@@ -28,3 +28,15 @@ def test_of_four_simulators_some_leave_and_join_while_the_run_goes_on():
     assert ended.failures == []
     assert ended.errors == {}
     assert {name for name in stalls if happened(ended, f'leaves {name} out')} == set(stalls)
+
+
+def test_two_simulators_join_a_running_run_of_two_by_their_names_alone():
+    names = ('arm_3', 'arm_4')
+    planned = leaving(
+        TWO, {'sim_2': [(6.0, 5.0)]}, joiners=names, begins={'arm_3': 3.0, 'arm_4': 8.0}
+    )
+    ended = carry_out(planned, kept=20_000)
+    assert ended.failures == []
+    assert ended.errors == {}
+    for name in names:
+        assert any(f'{name} ' in line and 'publishes Transitions' in line for line in ended.trace)

@@ -74,4 +74,8 @@ def _alone(entry: Entry) -> bool:
         settings = parse_json(entry.record.settings)
     except ParseError:
         return False
-    return isinstance(settings, dict) and settings.get('simulators') == 1
+    return (
+        isinstance(settings, dict)
+        and settings.get('simulators') == 1
+        and not settings.get('joiners')
+    )

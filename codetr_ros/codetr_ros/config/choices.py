@@ -19,6 +19,20 @@ Scorers = tuple[
 ]
 """Names of scorers that are no simulators."""
 
+Joiners = tuple[
+    Annotated[
+        str,
+        Field(
+            pattern=in_words(
+                r'^[A-Za-z][A-Za-z0-9_]{0,63}$',
+                'the name of a node: 1 to 64 letters, digits and underscores, a letter first',
+            )
+        ),
+    ],
+    ...,
+]
+"""Names of simulators that may join a running run."""
+
 Composite = Literal[
     'sum',
     'sum_square',

@@ -14,7 +14,7 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from codetr_ros.config.base import Group, SettingsError, flatten, in_words, validate
-from codetr_ros.config.choices import SCORE_LEARNERS, Composite, Method, Scorer, Scorers
+from codetr_ros.config.choices import SCORE_LEARNERS, Composite, Joiners, Method, Scorer, Scorers
 from codetr_ros.config.delays import Delay, Delayed
 from codetr_ros.config.methods import (
     AggregateSettings,
@@ -127,6 +127,13 @@ class Settings(Schedule, Delayed, Scored, Threaded, Group):
     )
     simulators: int = Field(
         1, ge=1, le=64, description='simulators that share the steps of a phase'
+    )
+    joiners: Joiners = Field(
+        (),
+        max_length=64,
+        description='names of further simulators that share the steps of a phase, but need not be '
+        'there at the start: they join the running run, leave it and join it again. The share of '
+        'those that are not there is missing',
     )
     envs: int = Field(
         1,
@@ -286,6 +293,24 @@ class Settings(Schedule, Delayed, Scored, Threaded, Group):
                     f'{name}={getattr(self, name)} with task={self.task}: nothing simulates the '
                     f'steps of a robot, and there is one of it; set {name}={due}'
                 )
+        return self
+
+    @model_validator(mode='after')
+    def _joiners_have_names_of_their_own(self) -> 'Settings':
+        if not self.joiners:
+            return self
+        if len(set(self.joiners)) < len(self.joiners) or set(self.joiners) & set(
+            self.simulator_names
+        ):
+            raise ValueError(
+                f'joiners={list(self.joiners)}: each needs a name of its own, other than '
+                f'{", ".join(self.simulator_names)}'
+            )
+        if self.free or self.on_robot:
+            raise ValueError(
+                f'joiners={list(self.joiners)} with pace={self.pace} and task={self.task}: nobody '
+                'joins a robot; leave out joiners'
+            )
         return self
 
     @model_validator(mode='after')

@@ -22,6 +22,7 @@ class Schedule:
         warmup_steps: int
         overlap: bool
         simulators: int
+        joiners: tuple[str, ...]
         envs: int
         evaluate_every: int
 
@@ -119,7 +120,17 @@ class Schedule:
     @property
     def source_count(self) -> int:
         """Number of sources of the run: the environments of all simulators."""
-        return self.simulators * self.envs
+        return (self.simulators + len(self.joiners)) * self.envs
+
+    @property
+    def joining_sources(self) -> frozenset[str]:
+        """The sources of simulators that need not be there at the start."""
+        return frozenset(source for name in self.joiners for source in self.sources_of(name))
+
+    @property
+    def alone(self) -> bool:
+        """Whether a single simulator takes all steps: nothing goes on without it."""
+        return self.simulators + len(self.joiners) == 1
 
     def sources_of(self, simulator: str) -> tuple[str, ...]:
         """Names of a simulator's sources: its own name for one environment; sim-1, sim-2, ... for

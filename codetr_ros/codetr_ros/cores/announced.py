@@ -28,6 +28,7 @@ class Tasks:
     def __init__(self, run: RunSpec, settings: Settings) -> None:
         self._run = run
         self._settings = settings
+        self._joining = settings.joining_sources
         self.specs: dict[str, TaskSpec] = {}
         self._unannounced: list[Transitions] = []
         self._bytes = 0  # of their arrays
@@ -35,8 +36,9 @@ class Tasks:
 
     @property
     def known(self) -> bool:
-        """Whether all sources of the run have announced what they simulate."""
-        return len(self.specs) == self._settings.source_count
+        """Whether all sources that the run needs have announced what they simulate."""
+        needed = self._settings.source_count - len(self._joining)
+        return len(self.specs.keys() - self._joining) == needed
 
     @property
     def first(self) -> TaskSpec:
@@ -45,8 +47,8 @@ class Tasks:
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Names of the sources, sorted."""
-        return tuple(sorted(self.specs))
+        """Names of the sources, sorted, also of those that may join later."""
+        return tuple(sorted(self.specs.keys() | self._joining))
 
     def receive(self, spec: TaskSpec) -> None:
         """Take the announcement of what a source simulates.
@@ -68,7 +70,7 @@ class Tasks:
                         f'has {getattr(known, name)!r}: all simulators of a run must simulate '
                         'the same task'
                     )
-        if spec.source not in self.specs and self.known:
+        if spec.source not in self.specs and spec.source not in self._joining and self.known:
             raise RecordError(
                 f'{spec.source!r} is one simulator too many: the run has '
                 f'simulators={self._settings.simulators} with envs={self._settings.envs} each '
@@ -101,7 +103,7 @@ class Tasks:
         if spec is not None:
             check_transitions(chunk, spec)
             return True
-        if self.known:
+        if self.known and chunk.source not in self._joining:
             raise RecordError(
                 f'{describe(chunk)}: {chunk.source!r} is no simulator of this run; these are: '
                 f'{", ".join(self.sources)}'

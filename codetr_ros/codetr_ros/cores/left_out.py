@@ -64,7 +64,7 @@ class Absent:
     """The sources that are permitted nothing in a phase, by the commits.
 
     Those that the commit of the phase names with which the permission was learnt: `lag` phases
-    before. In the first phases, which are permitted before there is a commit, nobody.
+    before. In the first phases, which are permitted before there is a commit, those that may join.
 
     Args:
         settings: of the run.
@@ -82,4 +82,4 @@ class Absent:
     def of(self, phase: int) -> frozenset[str] | None:
         """Who is permitted nothing in a phase; None if that cannot be known yet."""
         decided = phase - self._settings.lag
-        return frozenset() if decided < 0 else self._dropped.get(decided)
+        return self._settings.joining_sources if decided < 0 else self._dropped.get(decided)

@@ -87,7 +87,7 @@ class Recorder(Part):
         self._numbers: defaultdict[str, Numbering] = defaultdict(Numbering)
         self._committed_scores: Counter[str] = Counter()
         self._left_out = LeftOut(settings)
-        self._absent: set[str] = set()  # left out, and not there again
+        self._absent = set(settings.joining_sources)  # not there yet, or left out
         self._counters: Counter[str] = Counter()
         self.refused = self._tasks.refused
         self.phase = 0  # the next to be committed
@@ -164,12 +164,13 @@ class Recorder(Part):
             RecordError: says what it permits.
         """
         shares = dict.fromkeys(policy.sources, 0)
-        if self._tasks.known:
-            own = self._settings.shares_of(policy.phase)
-            shares |= dict(zip(self._tasks.sources, own, strict=True))
+        names = self._tasks.sources if self._tasks.known else tuple(sorted(policy.sources))
+        own = self._settings.shares_of(policy.phase)
         given = dict(zip(policy.sources, policy.steps.tolist(), strict=True))
-        due = sum(shares[source] for source, n in given.items() if n)
-        if not self._tasks.known or not any(given.values()):
+        if len(names) == len(own) and any(given.values()):
+            shares |= dict(zip(names, own, strict=True))
+            due = sum(shares[source] for source, n in given.items() if n)
+        else:
             due = self._settings.steps_of(policy.phase)
         if policy.phase < self.phase or sum(given.values()) != due:
             raise RecordError(
@@ -308,7 +309,7 @@ class Recorder(Part):
             step = self._settings.steps_after(phase)
             values = {'phase_seconds': seconds}
             commit = self._commit(phase)
-            if self._settings.simulators > 1:
+            if not self._settings.alone:
                 values['sources_left_out'] = len(commit.dropped)
             # the commit last: a bag that ends with it has all of the phase
             yield [

@@ -213,8 +213,11 @@ class Admission:
                 'name (--ros-args -r __node:=other) or namespace'
             )
         if holder is None and self.settings is not None and place[0] == 'sim':
-            there = sum(role == 'sim' for role, _ in self._holders)
-            if there >= self.settings.simulators:
+            joiners = self.settings.joiners
+            there = sum(
+                role == 'sim' and _last(name) not in joiners for role, name in self._holders
+            )
+            if there >= self.settings.simulators and _last(place[1]) not in joiners:
                 raise RecordError(
                     f'{describe(record)} is of one simulator too many, {_words(place)}: the run '
                     f'has simulators={self.settings.simulators}. Start the run with more, or stop '
@@ -247,6 +250,11 @@ class Admission:
                 f'{describe(record)} was published by {_words(member.place)}: no {role} publishes '
                 f'on {topic!r}'
             )
+
+
+def _last(name: str) -> str:
+    """The last part of a node's name."""
+    return name.rpartition('/')[2]
 
 
 def _words(place: Place) -> str:

@@ -29,7 +29,7 @@ class Behind:
         self._traffic = traffic
         self._core = core
         self._held: dict[int, tuple[Policy, RecordError]] = {}  # with why it cannot be taken
-        if settings.simulators > 1:  # else no phase goes on without it
+        if not settings.alone:  # else no phase goes on without it
             traffic.early = self._hold
 
     def _hold(self, record: Record, error: RecordError) -> bool:

@@ -37,7 +37,7 @@ class Silence:
         if self._since is None or self._attention.was_away(now):
             self._since = now
         settings = self._settings
-        if not self.after or settings.free or settings.simulators == 1:
+        if not self.after or settings.free or settings.alone:
             return {}
         return {
             source: now - peer.received_at

@@ -117,6 +117,7 @@ class Node:
             now = time.monotonic()
             if (away := attention.was_away(now)) and waiting is not None:
                 self._log.warning(f'was held for {away:.0f} s, in which it read nothing')
+                wiring.held()
                 waiting = None
             waiting = now if waiting is None else waiting
             if core.finished:

@@ -40,6 +40,7 @@ from codetr_ros.records import (
 )
 from codetr_ros.records.roles import ROLES, WRITERS
 from codetr_ros.ros.fetch import SERVICE
+from codetr_ros.ros.gathering import IDLE
 from codetr_ros.ros.joining import Joined
 from codetr_ros.ros.membership import Membership
 from codetr_ros.ros.resend import PhaseService
@@ -48,6 +49,9 @@ from codetr_ros.ros.wiring import Wiring
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.reports import BagReport
 
+CATCH_UP = 10.0
+"""The most seconds that a recorder which was held takes to ask others for what it has missed. They
+keep it for some phases only, so that it commits none meanwhile."""
 JUDGEMENTS = (CompositeReward, Preference)
 
 
@@ -73,6 +77,7 @@ class Recording(Wiring):
         core = cast(Recorder, joined.core)
         self._beside = Beside(joined.run, settings, lambda: core.phase)
         self._unannounced = Early(settings)
+        self._catches_up = 0.0  # until when [s, monotonic]
         self._early: list[Record] = []  # came while something before them was lacking
         self._sweeper = Sweeper(member.link, joined.run.run_id, self._knows, self._take_again)
 
@@ -231,11 +236,25 @@ class Recording(Wiring):
         if not isinstance(given, Commit):
             super().deliver(given)
             return
+        self._catch_up()
         self._bag.check_room()
         raw = link.message(given)
         self._write(given, raw)
         self._bag.flush()
         link.send(TOPICS[Commit], raw)
+
+    def held(self) -> None:
+        """Ask all nodes for what was published while nothing was read: the middleware takes who is
+        silent for 20 s for gone, and drops what is for him.
+        """
+        self._sweeper.ask(self._nodes())
+        self._catches_up = time.monotonic() + CATCH_UP
+
+    def _catch_up(self) -> None:
+        """Wait until what was missed has been sent again."""
+        while self._sweeper.busy and time.monotonic() < self._catches_up and not self.member.stop:
+            self.member.turn(IDLE)
+            self._sweeper.check()
 
     # ---- waiting
 

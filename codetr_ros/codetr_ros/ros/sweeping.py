@@ -52,6 +52,11 @@ class Sweeper:
             if node != self._present:
                 self._wanted.setdefault(node, self._asked.get(node, -AGAIN) + AGAIN)
 
+    @property
+    def busy(self) -> bool:
+        """Whether a node is still to be asked, or to answer."""
+        return self._present is not None or bool(self._wanted)
+
     def check(self) -> None:
         """Go on with the next node, where one has answered or does not answer any more."""
         if self._present is not None:

@@ -78,6 +78,9 @@ class Wiring:
             self._course.note(each)
         self._course.tick(doing)
 
+    def held(self) -> None:
+        """Note that the process was held, and has read nothing for a while."""
+
     def pause(self) -> float:
         """Seconds to wait for a message when there is nothing to do."""
         return IDLE

@@ -25,7 +25,7 @@ class Leavers:
             return []
         self._next = commit.phase + 1
         news = [
-            f'{name} is left out from phase {commit.phase} on: nothing comes from it'
+            f'{name} is left out from phase {commit.phase} on: it is not there'
             for name in commit.dropped
             if name not in self.since
         ]

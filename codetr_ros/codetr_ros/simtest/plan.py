@@ -137,7 +137,7 @@ class Plan:
 
 def names_of(settings: Settings) -> dict[str, str]:
     """The nodes of a run: role by name."""
-    roles = dict.fromkeys(settings.simulator_names, 'sim')
+    roles = dict.fromkeys((*settings.simulator_names, *settings.joiners), 'sim')
     return roles | {role: role for role in settings.roles if role != 'sim'}
 
 
