@@ -10,6 +10,7 @@ import pytest
 from codetr_ros import cli
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.verify import verify
+from codetr_ros.cli import results
 from codetr_ros.cores.labeller import Labeller
 from codetr_ros.cores.learner import Learner
 from codetr_ros.offline.replay import replay
@@ -17,6 +18,7 @@ from codetr_ros.offline.robot_report import faults, robot_page
 from codetr_ros.offline.score_course import score_course
 from codetr_ros.records import Commit, CompositeReward, Policy, RunSpec, StepRewards, Transitions
 from codetr_ros.runs.reports import NodeReport
+from codetr_ros.runs.summary import Summary
 from helpers.builders import run
 from helpers.foreign_bags import write
 from helpers.free_runs import FreeRun, free_run
@@ -152,3 +154,15 @@ def test_labels_that_the_bag_has_phases_later_are_compared_when_it_is_replayed(
     made = replay(Bag(bag))
     assert made.same['labels'] > 0
     assert not made.differences
+
+
+def test_the_summary_of_such_a_run_has_the_scores_by_phase_and_asks_for_no_true_rewards(
+    a_free_run, tmp_path
+):
+    bag = write(tmp_path / 'bag', a_free_run.records)
+    logged: list[str] = []
+    made = Summary(a_free_run.settings, 'run', in_process=False)
+    results.complete(made, bag, logged.append)
+    assert logged == []
+    assert sum(row.scores for row in made.scores_given) == len(of(a_free_run, CompositeReward))
+    assert [row.random for row in made.scores_given[:3]] == [True, True, False]

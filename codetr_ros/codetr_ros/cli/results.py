@@ -55,7 +55,11 @@ def complete(
         bag = Bag(path, faults.setdefault)
         # labels last: they may have been recorded before the true rewards of their phase
         unlabelled = (EpisodeResult, Metrics, Commit, TrueRewards, CompositeReward)
-        for kinds in unlabelled, (StepRewards,):
+        if summary.settings.scored_elsewhere:
+            summary.scores_given = score_course(bag).rows(summary.settings.warmup_phases)
+        # nobody knows the true rewards of a robot, with which labels are compared
+        compared = () if summary.settings.on_robot else ((StepRewards,),)
+        for kinds in (unlabelled, *compared):
             for entry in undropped_entries(bag, kinds):
                 if stopped():
                     log('stopped: the summary holds what was read until now')
@@ -63,8 +67,6 @@ def complete(
                 record: Record = entry.record
                 if record.run_id == summary.run_id:
                     summary.receive(record)
-        if summary.settings.scored_elsewhere:
-            summary.scores_given = score_course(bag).rows(summary.settings.warmup_phases)
     except BagError as error:
         log(f'the summary holds what was received, and the bag up to a fault: {error}')
     except RecoveryError as error:
