@@ -8,6 +8,7 @@ store what arrived; only a stop acts at once.
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -25,6 +26,7 @@ DONE = TransitionCallbackReturn.SUCCESS
 SENSOR_DEPTH = 10
 SENSOR = QoSProfile(depth=SENSOR_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Matches reliable and best-effort publishers; what is older than ten messages is of no use."""
+LAST_COMMAND = 0.5  # [s] to wait at the end for the robot to have received the safe command
 SCORES_DEPTH = 1000
 """Scores are few, and each counts."""
 
@@ -239,7 +241,10 @@ class Driver(LifecycleNode):  # type: ignore[misc]
         return DONE
 
     def close(self) -> None:
-        """Take the node off the graph."""
+        """Take the node off the graph, once the robot has the last command."""
+        if self._publisher is not None:
+            # with the publisher, what has not arrived yet would be gone
+            self._publisher.wait_for_all_acked(Duration(seconds=LAST_COMMAND))
         self._link.release(self)
 
 
