@@ -8,7 +8,14 @@ from codetr_ros.bags.definitions import decode
 from codetr_ros.bags.errors import BagError
 from codetr_ros.bags.verify import Verdict, verify
 from codetr_ros.nodes import errors
-from codetr_ros.records import TOPICS, Commit, CompositeReward, StepRewards, Transitions
+from codetr_ros.records import (
+    TOPICS,
+    Commit,
+    CompositeReward,
+    RecordError,
+    StepRewards,
+    Transitions,
+)
 from codetr_ros.simtest.disks import TroubledDisk
 from codetr_ros.simtest.process import Process
 
@@ -40,7 +47,8 @@ def at_the_end(run: 'Simulated') -> list[str]:
     found += _weights(run)
     found += _uncounted(processes)
     found += _bag(run, whole=not gave_up)
-    if not gave_up and not run.dropped():  # what was dropped may have come too late for the bag
+    # what was dropped may have come too late for the bag; of the dead nobody knows the counts
+    if not gave_up and not run.dropped() and not run.plan.deaths:
         found += _unrecorded(run)
     return found
 
@@ -56,7 +64,11 @@ def _unexplained(processes: list[Process]) -> Iterator[str]:
 
 def _weights(run: 'Simulated') -> Iterator[str]:
     """Learner and reward node, wherever they finished, have the weights of the undisturbed run."""
-    expected = run.expected()
+    try:
+        expected = run.expected()
+    except RecordError as error:
+        yield f'what was recorded cannot be learnt from again: {error}'
+        return
     for name, field in (('learner', 'policy_sha256'), ('reward', 'reward_model_sha256')):
         process = run.processes.get(name)
         if process is None or not process.core.finished:

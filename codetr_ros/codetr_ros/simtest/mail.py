@@ -74,9 +74,8 @@ class Post:
         self.network.send(sender.name, reader, packet.kind, self._arrives(reader, packet), True)
 
     def _arrives(self, name: str, packet: Packet) -> Handle:
-        reader = self.processes[name]
-
         def handle() -> None:
+            reader = self.processes[name]  # that lives now
             if isinstance(packet.data, bytes):
                 self.watch(packet.kind, packet.data, reader)
             reader.arrive(packet)

@@ -54,6 +54,21 @@ def all_settings() -> tuple[Settings, ...]:
 
 
 @dataclass(frozen=True)
+class Death:
+    """A simulator is killed, and started again.
+
+    Attributes:
+        name: of the node.
+        at: when [s].
+        seconds: until it is there again.
+    """
+
+    name: str
+    at: float
+    seconds: float
+
+
+@dataclass(frozen=True)
 class Plan:
     """A simulated run and its troubles.
 
@@ -66,6 +81,7 @@ class Plan:
         heals: whether the run must end as if nothing had happened; else it may also end by an
             error that names its cause.
         leave_out_after: seconds of silence after which a source is left out of a phase; 0: never.
+        deaths: simulators that are killed, and come back. Seeds draw none yet.
     """
 
     seed: int
@@ -75,6 +91,7 @@ class Plan:
     disk: Trouble = field(default_factory=Trouble)
     heals: bool = True
     leave_out_after: float = 0.0
+    deaths: tuple[Death, ...] = ()
 
     @property
     def calm(self) -> bool:

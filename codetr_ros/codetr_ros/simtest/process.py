@@ -23,6 +23,7 @@ from codetr_ros.nodes.peers import GAVE_UP, Peers
 from codetr_ros.nodes.traffic import Traffic
 from codetr_ros.records import TOPICS, Commit, Presence, Record, RunSpec, describe
 from codetr_ros.records.roles import published_by
+from codetr_ros.simtest.network import KEPT_FOR_LATE
 from codetr_ros.simtest.world import World
 
 PRESENCE_EVERY = 1.0  # [s]
@@ -114,6 +115,7 @@ class Process:
         newest_committed: returns the last committed phase, as its recorder answers.
         when_displaced: called while it is permitted to go on after it was left out.
         repeated: second copies that it has taken, by topic.
+        kept: what has arrived on topics that keep their messages for late readers.
 
     Args:
         world: where it is.
@@ -149,6 +151,7 @@ class Process:
         self.when_displaced: Callable[[Process], None] = lambda process: None
         self.ended = False
         self.finished = False  # the core was, when it ended
+        self.kept: list[Packet] = []
         self.repeated: Counter[str] = Counter()
         self.published: Counter[str] = Counter()
         self.doing = 'starting'
@@ -194,6 +197,8 @@ class Process:
     def arrive(self, packet: Packet) -> None:
         """Take a message into the inbox; wakes the node if it waits."""
         self._inbox.append(packet)
+        if packet.kind in KEPT_FOR_LATE:
+            self.kept.append(packet)
         if self._idle and not self.ended:
             self._idle = False
             self._schedule(self.world.now)
@@ -331,6 +336,12 @@ class Process:
         self.mail.publish(self, Packet(Presence, 0, presence))
 
     # ---- the end
+
+    def die(self) -> None:
+        """End at once: nobody hears of it."""
+        self.ended = True
+        self.core.close()
+        self.world.note(self.name, 'is killed')
 
     def settled(self, seconds: float) -> bool:
         """Whether the node may end, `seconds` after its core has finished."""

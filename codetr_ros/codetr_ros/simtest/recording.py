@@ -11,9 +11,19 @@ from codetr_ros.config import Settings
 from codetr_ros.cores.beside import Beside, Early
 from codetr_ros.cores.recorder import Recorder
 from codetr_ros.nodes.last_phases import LastPhases
+from codetr_ros.nodes.repeats import Repeats
 from codetr_ros.nodes.settling import Settling, still_missing
 from codetr_ros.nodes.silence import Silence
-from codetr_ros.records import TOPICS, Commit, Presence, Record, RunSpec, TaskSpec
+from codetr_ros.records import (
+    TOPICS,
+    Commit,
+    EpisodeResult,
+    Metrics,
+    Presence,
+    Record,
+    RunSpec,
+    TaskSpec,
+)
 from codetr_ros.records.fields import type_name
 from codetr_ros.records.roles import published_by
 from codetr_ros.simtest.disks import TroubledDisk
@@ -47,6 +57,7 @@ class Recording(Process):
         core = cast(Recorder, self.core)
         self._beside = Beside(self.run, settings, lambda: core.phase)
         self._early = Early(settings)
+        self._repeats = Repeats()
         self._settling = Settling(f'/{self.name}', self.peers, self.limit)
         self._write(RunSpec, encode(self.run))
 
@@ -68,6 +79,10 @@ class Recording(Process):
 
     def _admit(self, record: Record, raw: bytes) -> None:
         if self._early.holds(record, raw):
+            return
+        beside = isinstance(record, (EpisodeResult, Metrics))
+        if beside and self._repeats.note(record):  # of a node that was started again
+            self.core.duplicated[TOPICS[type(record)]] += 1
             return
         learnt_from = type(record) in self.core.subscribes
         if not self.traffic.receive(record, None if learnt_from else self._beside):

@@ -5,7 +5,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,13 +21,13 @@ from codetr_ros.cores.learner import Learner
 from codetr_ros.cores.recorder import Recorder
 from codetr_ros.cores.simulator import Simulator
 from codetr_ros.nodes import errors
-from codetr_ros.records import Commit, Record, RunSpec
+from codetr_ros.records import Commit, CompositeReward, Record, RunSpec
 from codetr_ros.records.dropped import undropped
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.simtest import checks
 from codetr_ros.simtest.disks import TroubledDisk
 from codetr_ros.simtest.mail import Post
-from codetr_ros.simtest.plan import DEADLINE, Plan, names_of, plan
+from codetr_ros.simtest.plan import DEADLINE, Death, Plan, names_of, plan
 from codetr_ros.simtest.process import Process
 from codetr_ros.simtest.recording import Recording
 from codetr_ros.simtest.replay import replayed
@@ -127,6 +127,53 @@ class Simulated:
         for each in self.processes.values():
             if each.error is not None:
                 each.end()
+        self._dead = 0  # processes that will be there again
+        for death in planned.deaths:
+            self.world.at(death.at, partial(self._kill, death))
+
+    def _kill(self, death: Death) -> None:
+        killed = self.processes[death.name]
+        # nodes that have ended here publish no presence any more, as real ones do for a while
+        under_way = cast(Recorder, self.recording.core).phase < self.plan.settings.phases
+        if under_way and not killed.ended:
+            killed.die()
+            self._dead += 1
+            again = partial(self._start_again, killed)
+            self.world.at(self.world.now + death.seconds, again)
+
+    def _start_again(self, killed: Process) -> None:
+        """Start a simulator that was killed: it goes on behind the last committed phase."""
+        self._dead -= 1
+        settings, name = self.plan.settings, killed.name
+        core = Simulator(killed.run, settings, name)
+        committed = cast(Recorder, self.recording.core).phase
+        if committed:
+            for record in self._committed():
+                core.restore(record)
+            core.resume(committed)
+        pace = replace(self.plan.paces[name], begins=self.world.now)
+        made = Process(
+            self.world, self.post, killed.run, settings, 'sim', name, core, pace, DEADLINE,
+            killed.instance + 1,
+        )  # fmt: skip
+        made.newest_committed = self._newest_committed
+        made.when_displaced = self._take_place
+        self.processes[name] = made
+        for packet in killed.kept:
+            made.arrive(packet)
+        self.world.note(name, f'is started again, behind phase {committed - 1}')
+
+    def _committed(self) -> Iterator[Record]:
+        """The records of committed phases."""
+        there = [decode(kind, raw) for kind, raw in self.recording.history]
+        last = next(each for each in reversed(there) if isinstance(each, Commit))
+        scores = dict(zip(last.scorers, last.scores.tolist(), strict=True))
+        for record in undropped(there):
+            if isinstance(record, CompositeReward):
+                if record.sequence <= scores.get(record.scorer, -1):
+                    yield record
+            elif getattr(record, 'phase', -1) <= last.phase:
+                yield record
 
     def _record(self, common: tuple[Any, ...]) -> Recording:
         return Recording(
@@ -185,7 +232,7 @@ class Simulated:
         processes = self.processes.values()
         over = self.world.run(
             self.plan.longest,
-            lambda: bool(self.failures) or all(p.ended for p in processes),
+            lambda: bool(self.failures) or (not self._dead and all(p.ended for p in processes)),
         )
         for each in processes:
             each.core.close()
