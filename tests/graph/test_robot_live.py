@@ -46,7 +46,7 @@ class Onlooker(Person):
         self.policies: list[Policy] = []
         for kind, into in ((Transitions, self.chunks), (Policy, self.policies)):
             self.link.subscribe(
-                kind, lambda k, data, into=into: into.extend(nodes.sound(k, data)), SETTINGS
+                kind, lambda k, data, into=into: into.extend(self.sound(k, data)), SETTINGS
             )
         node = self.link.node
         self.heart = node.create_publisher(Empty, HEARTBEAT, 10)
