@@ -81,7 +81,8 @@ class Recording(Process):
         if self._early.holds(record, raw):
             return
         beside = isinstance(record, (EpisodeResult, Metrics))
-        if beside and self._repeats.note(record):  # of a node that was started again
+        ours = record.run_id == self.run.run_id
+        if beside and ours and self._repeats.note(record):  # of a node that was started again
             self.core.duplicated[TOPICS[type(record)]] += 1
             return
         learnt_from = type(record) in self.core.subscribes
