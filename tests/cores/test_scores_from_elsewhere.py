@@ -310,12 +310,13 @@ def test_nothing_is_learnt_from_the_first_three_scores_since_their_scale_would_b
     assert of(StepRewards, reward.phase(1))[0].labels.size > 0
 
 
-def test_preferences_that_a_method_cannot_use_are_counted():
+def test_preferences_that_a_method_cannot_use_are_counted(caplog):
     reward = Reward()
     reward.judge(*(judged(n, first_step=7 * n) for n in range(4)))
     reward.judge(preference(sequence=4))
     reward.phase(0)
     assert reward.core.report().counters['preferences not used, method cannot'] == 1
+    assert 'preferences not used, method cannot (1 so far)' in caplog.text
 
 
 def test_who_scored_and_on_what_scale_is_published_after_each_phase():

@@ -7,6 +7,7 @@ from codetr_ros.config.cuts import Cuts
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import CompositeReward, Preference
 from codetr_ros.rewards import registry
+from codetr_ros.runs.reports import PREFERENCES_UNUSED, VERDICTS_AS_NUMBERS
 from helpers import builders
 from helpers.builders import ACTION, OBSERVATION, tiny
 
@@ -142,6 +143,34 @@ def test_methods_that_cannot_use_preferences_state_so():
     assert not registry.make(chosen, OBSERVATION, ACTION).uses_preferences
     soft = tiny(scorer='topic', method='evidence', composite='max', evidence__link='known')
     assert not registry.make(soft, OBSERVATION, ACTION).uses_preferences
+
+
+@pytest.mark.parametrize(
+    ('changes', 'scores', 'aside'),
+    [
+        ({}, 30, {}),
+        ({'evidence__link': 'choose'}, 30, {PREFERENCES_UNUSED: 20}),
+        ({'composite': 'max'}, 30, {PREFERENCES_UNUSED: 20}),
+        ({'composite': 'peak_end'}, 30, {PREFERENCES_UNUSED: 20}),
+        ({'evidence__score_scale': 'ordinal'}, 30, {VERDICTS_AS_NUMBERS: 30}),
+        ({'evidence__score_scale': 'ordinal'}, 0, {}),
+        ({'method': 'uniform'}, 30, {PREFERENCES_UNUSED: 20}),
+        ({'method': 'codetr', 'codetr__base': 'evidence', 'composite': 'max'}, 30,
+         {PREFERENCES_UNUSED: 20}),
+    ],
+    ids=range(8),
+)  # fmt: skip
+def test_judgements_that_are_not_learnt_from_as_they_were_stated_are_counted(
+    changes, scores, aside
+):
+    memory = planted(20, scores=scores)[0]
+    method = registry.make(
+        tiny(**({'scorer': 'topic', 'delay': DELAY, 'method': 'evidence'} | changes)),
+        OBSERVATION,
+        ACTION,
+    )
+    assert len(memory.judgements.pairs()) == 20
+    assert method.set_aside(memory) == aside
 
 
 def test_a_score_is_not_mistaken_for_a_preference():

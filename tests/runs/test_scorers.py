@@ -2,6 +2,7 @@
 
 from codetr_ros.records import metrics
 from codetr_ros.runs import report
+from codetr_ros.runs.reports import PREFERENCES_UNUSED
 from helpers.summaries import run_summary
 
 
@@ -28,6 +29,13 @@ def test_the_summary_has_each_scorer_as_the_last_phase_knew_it():
 def test_the_report_shows_who_scored_and_how_well_they_agree():
     text = report.page(with_scorers(), b'')
     assert 'Who scored' in text and '0.87' in text and 'not known' in text
+
+
+def test_the_report_counts_judgements_that_were_not_learnt_from_as_stated():
+    known = with_scorers()
+    assert PREFERENCES_UNUSED not in report.page(known, b'')
+    unused = known.model_copy(update={'counters': {'reward': {PREFERENCES_UNUSED: 4}}})
+    assert f'4 {PREFERENCES_UNUSED}: method' in report.page(unused, b'')
 
 
 def test_where_the_simulator_scored_nothing_is_shown_of_scorers():

@@ -1,5 +1,6 @@
 """The reward side of Algorithm 1: take a phase in, fit, label, publish the changed labels."""
 
+import logging
 import time
 from collections import Counter
 from collections.abc import Generator, Iterator
@@ -36,6 +37,8 @@ from codetr_ros.runs import checkpoints
 from codetr_ros.runs.checkpoints import Checkpoint
 from codetr_ros.runs.reports import CoreReport, StartedFrom
 from codetr_ros.seeding import generator, seed_torch
+
+_log = logging.getLogger(__name__)
 
 
 class Labeller(Consumer):
@@ -184,13 +187,22 @@ class Labeller(Consumer):
         if memory.judgements is None:
             return {}
         facts = memory.judgements.facts()
-        pairs = sum(fact.preferences for fact in facts.values())
-        if pairs and not method.uses_preferences:
-            self._counters['preferences not used, method cannot'] = pairs
+        self._note_set_aside(method.set_aside(memory))
         known = {'segments_scored': float(len(memory.segments.ids()))}
         for name, fact in facts.items():
             known |= {f'scorer_{name}_{what}': float(n) for what, n in asdict(fact).items()}
         return known
+
+    def _note_set_aside(self, counts: dict[str, int]) -> None:
+        """Count judgements that are not learnt from as they were stated; log each reason once."""
+        for reason, count in counts.items():
+            if reason not in self._counters:
+                _log.warning(
+                    'method %s, composite %s: %s (%d so far): docs/methods.md#preferences names '
+                    'the methods that learn from them',
+                    *(self._settings.method, self._settings.composite, reason, count),
+                )
+            self._counters[reason] = count
 
     def _newest_permitted(self) -> int:
         """As of all consumers. But through the warm-up the learner waits for no labels."""

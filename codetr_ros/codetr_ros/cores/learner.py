@@ -31,7 +31,7 @@ from codetr_ros.records.digests import digest, digest_of_all
 from codetr_ros.records.roles import subscribed
 from codetr_ros.runs import checkpoints
 from codetr_ros.runs.checkpoints import Checkpoint
-from codetr_ros.runs.reports import CoreReport
+from codetr_ros.runs.reports import PREFERENCES_UNUSED, CoreReport
 from codetr_ros.system.devices import usable
 
 _log = logging.getLogger(__name__)
@@ -205,6 +205,14 @@ class Learner(Consumer):
             'learner_counters': dict(self._learner.counters),
         }
 
+    def _set_aside(self) -> dict[str, int]:
+        """Preferences, where the learner learns from scores itself and nobody from those."""
+        memory = self._memory
+        if self._settings.labels_steps or memory is None or memory.judgements is None:
+            return {}
+        pairs = len(memory.judgements.pairs())
+        return {PREFERENCES_UNUSED: pairs} if pairs else {}
+
     def report(self) -> CoreReport:
         """Counts and the digest of the policy, for the run's summary."""
         report = super().report()
@@ -213,7 +221,7 @@ class Learner(Consumer):
         return report.model_copy(
             update={
                 'updates': self._learner.updates,
-                'counters': report.counters | self._learner.counters,
+                'counters': report.counters | self._learner.counters | self._set_aside(),
                 'policy_sha256': checkpoints.digest(self._learner.actor.state_dict()),
             }
         )

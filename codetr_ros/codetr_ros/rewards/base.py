@@ -13,6 +13,7 @@ from codetr_ros.config import Settings
 from codetr_ros.memory.batches import SegmentBatch
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import F32, F64
+from codetr_ros.runs.reports import PREFERENCES_UNUSED
 from codetr_ros.system.states import check_state
 
 ModelFacts = dict[str, str | float | list[float]]
@@ -85,6 +86,11 @@ class RewardMethod(ABC):
     def unit(self) -> float:
         """The factor by which labels are multiplied to be in the task's unit."""
         return self.target_scale if self._settings.reward_unit == 'scaled' else 1.0
+
+    def set_aside(self, memory: Trajectories) -> dict[str, int]:
+        """How many judgements are not learnt from as they were stated, by the reason in words."""
+        pairs = 0 if memory.judgements is None else len(memory.judgements.pairs())
+        return {PREFERENCES_UNUSED: pairs} if pairs and not self.uses_preferences else {}
 
     def prepare(self, memory: Trajectories) -> None:
         """Look at the memory before a phase's gradient steps and labels.

@@ -73,6 +73,10 @@ class CodetrOnEvidence(Codetr):
         """Whether the regression does."""
         return self._base.uses_preferences
 
+    def set_aside(self, memory: Trajectories) -> dict[str, int]:
+        """What the regression sets aside: the network does not learn from judgements itself."""
+        return self._base.set_aside(memory)
+
     @property
     def version(self) -> int:
         """Fits of the regression, and gradient steps whose outcome the gate lets in."""

@@ -17,6 +17,11 @@ from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.facts import Counts, Facts
 from codetr_ros.system.files import atomic_write, make_folder
 
+PREFERENCES_UNUSED = 'preferences not used, method cannot'
+VERDICTS_AS_NUMBERS = 'verdicts taken for numbers, beside preferences'
+SET_ASIDE = (PREFERENCES_UNUSED, VERDICTS_AS_NUMBERS)
+"""Counts of judgements that are not learnt from as they were stated."""
+
 
 class MemoryFacts(Facts):
     """The contents of the memory D, and its size."""

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 
 from codetr_ros.runs.document import Block, Heading, Paragraph, Table
 from codetr_ros.runs.numbers import number
+from codetr_ros.runs.reports import SET_ASIDE
 from codetr_ros.runs.run_summary import RunSummary, ScorerRow
 
 _NAME = re.compile('scorer_(.+)_(scores|preferences|offset|slope|noise|agreement)')
@@ -37,6 +38,10 @@ def blocks(summary: RunSummary) -> Iterator[Block]:
         'scale of the first scorer. Agreement is the correlation with the mean of the others on '
         'shared segments. Counts are of what the memory held at the end.'
     )
+    for reason in SET_ASIDE:
+        count = sum(counts.get(reason, 0) for counts in summary.counters.values())
+        if count:
+            yield Paragraph(f'{count} {reason}: method {summary.settings["method"]}.')
     head = ['scorer', 'scores', 'preferences', 'offset', 'slope', 'noise', 'agreement']
 
     def shown(value: float | None) -> str:

@@ -44,6 +44,7 @@ from codetr_ros.rewards.evidence.uncertainty import (
     step_deviations,
 )
 from codetr_ros.rewards.evidence.verdicts import are_verdicts, require_few_values
+from codetr_ros.runs.reports import VERDICTS_AS_NUMBERS
 from codetr_ros.seeding import generator
 from codetr_ros.system.states import check_state
 
@@ -160,6 +161,13 @@ class Evidence(Predictor):
     def uses_preferences(self) -> bool:  # type: ignore[override]
         """Whether the kind of score is known and linear in step rewards."""
         return self._own.link != 'choose' and self._model.link.linear
+
+    def set_aside(self, memory: Trajectories) -> dict[str, int]:
+        """Preferences where F is not linear or not known; verdicts beside those that are used."""
+        aside = super().set_aside(memory)
+        if self._ordinal and self._pairs(memory) is not None and len(memory.segments.ids()):
+            aside[VERDICTS_AS_NUMBERS] = len(memory.segments.ids())
+        return aside
 
     def _pairs(self, memory: Trajectories) -> Pairs | None:
         """The preferences to learn from; None where there are none, or none can be used."""
