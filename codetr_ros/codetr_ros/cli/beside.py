@@ -17,6 +17,8 @@ from codetr_ros.runs import folder as run_folder
 
 PROGRAM = (sys.executable, '-m', 'codetr_ros.cli')
 LOG, SCORE_LOG, SERVICE_LOG = 'watch.log', 'score_page.log', 'score_service.log'
+STATED = ('at http', 'scores by service')
+"""One of these stands in the line with which a program states what it serves."""
 STOP_DEADLINE = 10.0
 """Seconds in which the page ends when asked to; then it is killed."""
 
@@ -69,9 +71,11 @@ class Beside:
             return
         assert self._process.stdout is not None
         self._told += self._process.stdout.read() or b''
-        if b'\n' in self._told:
+        lines = self._told[: self._told.rfind(b'\n') + 1].decode(errors='replace').splitlines()
+        # the middleware may print lines of its own
+        if found := [line for line in lines if any(word in line for word in STATED)]:
             self._known = True
-            self._log(self._told.decode(errors='replace').splitlines()[0])
+            self._log(found[0])
         elif self._process.poll() is not None:
             self._known = True
             code = self._process.returncode
