@@ -165,8 +165,10 @@ class Evidence(Predictor):
     def set_aside(self, memory: Trajectories) -> dict[str, int]:
         """Preferences where F is not linear or not known; verdicts beside those that are used."""
         aside = super().set_aside(memory)
-        if self._ordinal and self._pairs(memory) is not None and len(memory.segments.ids()):
-            aside[VERDICTS_AS_NUMBERS] = len(memory.segments.ids())
+        scores = memory.segments.scores(memory.segments.ids())
+        verdicts = self._ordinal and are_verdicts(scores, self._own.score_scale == 'ordinal')
+        if verdicts and self._pairs(memory) is not None:
+            aside[VERDICTS_AS_NUMBERS] = len(scores)
         return aside
 
     def _pairs(self, memory: Trajectories) -> Pairs | None:
