@@ -198,8 +198,8 @@ class Labeller(Consumer):
         for reason, count in counts.items():
             if reason not in self._counters:
                 _log.warning(
-                    'method %s, composite %s: %s (%d so far): docs/methods.md#preferences names '
-                    'the methods that learn from them',
+                    'method %s, composite %s: %s (%d so far): docs/methods.md names the methods '
+                    'that learn from them',
                     *(self._settings.method, self._settings.composite, reason, count),
                 )
             self._counters[reason] = count
