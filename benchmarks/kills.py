@@ -1,11 +1,17 @@
 """Does a run whose nodes are killed end as if nothing had happened?
 
-    .venv/bin/python benchmarks/kills.py [--runs N]
+    .venv/bin/python benchmarks/kills.py [--kills N] [--installed]
 
 Small runs over topics, in lock-step and with overlap, by three methods. In each, nodes are killed
-by a schedule that its seed draws: which, how many at once, in which phase and how long after its
-beginning, twice in a row now and then. The digests of policy and reward model are compared with
-those of the same run undisturbed. A row for each run; one that is in the file is not made again.
+one after the other by what its seed draws: which, how many at once, how many phases after those
+before, how long after the beginning of a phase, and now and then again while they start or go on.
+In every fifth run `codetr train` itself is killed too, and goes on with `--resume`. The digests of
+policy and reward model are compared with those of the same run undisturbed.
+
+A row for each run, with what each killed node was doing; one that is in the file is not made
+again. So a thousand kills can be made in several sessions: the script ends when the file has N.
+Nodes are forked from a process that has imported everything; with `--installed` they start as
+users start them, which takes five times as long.
 """
 
 import argparse
@@ -18,20 +24,31 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import yaml
 from rows import Rows
 
 sys.path.insert(0, str(Path(__file__).parent.parent / 'tests'))
+from codetr_ros.config import Settings
+from helpers import forked
 from helpers.builders import tiny
+from helpers.runs import CODETR, Command, write
 
 OUT = Path(__file__).parent / 'results' / 'kills.csv'
-COLUMNS = ('method', 'overlap', 'seed', 'kills', 'schedule', 'exit_code', 'seconds', 'same')
+COLUMNS = (
+    'method', 'overlap', 'seed', 'kills', 'schedule', 'exit_code', 'seconds', 'same', 'states',
+)  # fmt: skip
 KINDS = [(method, overlap) for method in ('codetr', 'rrd', 'none') for overlap in (False, True)]
-CODETR = Path(sys.prefix) / 'bin' / 'codetr'
-STEPS, PHASES = 2000, 10
-LONGEST = 600.0  # [s] for a run
+STEPS, PHASES = 4000, 20
+LONGEST = 900.0  # [s] for a run
+FLAGS = ('--no-film', '--restarts', '1000000', '--peer-deadline', '300')
+TRAIN = 'train'
+WITH_TRAIN = 5  # in every so manieth run `codetr train` is killed too
+
+Kill = tuple[int, float, list[str]]
+"""After how many more phases, and how many seconds later, which roles are killed."""
 
 
 def nodes(folder: Path) -> dict[str, int]:
@@ -40,9 +57,13 @@ def nodes(folder: Path) -> dict[str, int]:
     for place in Path('/proc').glob('[0-9]*'):
         try:
             words = (place / 'cmdline').read_bytes().decode(errors='replace').split('\0')
+            output = Path(os.readlink(place / 'fd' / '1'))
         except OSError:
             continue
-        if any(str(folder) in word for word in words):
+        if any('fork_server.py' in word for word in words):
+            if output.parent == folder / 'logs':
+                found[output.stem] = int(place.name)
+        elif any(str(folder) in word for word in words):
             for word in words:
                 if match := re.search(r'/lib/\w+/(sim|evaluate|reward|learner|record)$', word):
                     found[match[1]] = int(place.name)
@@ -51,78 +72,156 @@ def nodes(folder: Path) -> dict[str, int]:
 
 def phase_of(folder: Path) -> int:
     """Phases that are recorded so far, by the recorder's log; -1 before it began."""
-    log = folder / 'logs' / 'record.log'
-    said = log.read_text() if log.is_file() else ''
+    said = log_of(folder, 'record')
     done = re.findall(r'phase (\d+) of', said)
     return int(done[-1]) if done else 0 if 'everybody is there' in said else -1
 
 
-def schedule(seed: int, roles: list[str]) -> list[tuple[int, float, list[str]]]:
-    """What is killed: from which phase on, how many seconds later, which roles."""
+def log_of(folder: Path, role: str) -> str:
+    """What a node has logged."""
+    log = folder / 'logs' / f'{role}.log'
+    return log.read_text() if log.is_file() else ''
+
+
+def state_of(folder: Path, role: str) -> str:
+    """What a node does, by what it has logged since it was started."""
+    since = log_of(folder, role).rpartition('\n$ ')[2]
+    if 'everybody is there' not in since:
+        return 'starts'
+    if re.search(r'phase \d+ of', since) is None:
+        return 'goes on' if 'goes on' in since else 'begins'
+    return 'ends' if phase_of(folder) >= PHASES else 'works'
+
+
+def schedule(seed: int, roles: Sequence[str]) -> Iterator[Kill]:
+    """What is killed, for as long as the run takes."""
     rng = random.Random(seed)
-    planned = []
-    for phase in sorted(rng.sample(range(-1, PHASES), rng.randint(2, 4))):
+    while True:
         some = rng.sample(roles, rng.choice((1, 1, 1, 2, len(roles))))
-        planned.append((phase, rng.uniform(0, 1.5), some))
-        if rng.random() < 0.25:  # twice in a row
-            planned.append((phase, rng.uniform(0, 8), some))
-    return planned
+        yield rng.choice((1, 1, 2)), rng.uniform(0, 1.5), some
+        if rng.random() < 0.3:  # twice in a row: while they start, or go on
+            yield 0, rng.uniform(0, 4), some
 
 
-def run(folder: Path, config: Path, planned: list[tuple[int, float, list[str]]]) -> tuple:
-    """Do a run; kills, exit code, seconds and digests."""
-    began, kills = time.monotonic(), 0
-    flags = ['--no-film', '--restarts', '1000', '--peer-deadline', '300']
-    with (folder.with_suffix('.log')).open('w') as log:
-        command = subprocess.Popen(
-            [CODETR, 'train', '--config', config, '--out', folder, *flags],
-            stdout=log, stderr=subprocess.STDOUT,
-        )  # fmt: skip
-        todo = list(planned)
-        while command.poll() is None and time.monotonic() - began < LONGEST:
+class Run:
+    """A run that is killed again and again.
+
+    Args:
+        folder: of the run.
+        settings: its settings.
+        installed: whether its processes are started as users start them.
+    """
+
+    def __init__(self, folder: Path, settings: Settings, installed: bool) -> None:
+        self.folder = folder
+        self._installed = installed
+        self.states: Counter[str] = Counter()
+        self.done: list[str] = []
+        self.command = self._start('--config', str(write(settings, folder)), '--out', str(folder))
+
+    def _start(self, *arguments: str) -> Command:
+        words = ('train', *arguments, *FLAGS)
+        if not self._installed:
+            with self.folder.with_suffix('.log').open('ab') as log:
+                return forked.codetr(*words, environment=os.environ, output=log)
+        with self.folder.with_suffix('.log').open('ab') as log:
+            return subprocess.Popen(
+                [str(CODETR), *words], stdout=log, stderr=subprocess.STDOUT, text=True
+            )
+
+    def _until(self, phase: int, end: float) -> bool:
+        """Wait until so many phases are recorded; false if the run has ended."""
+        while phase_of(self.folder) < phase:
+            if self.command.poll() is not None or time.monotonic() > end:
+                return False
             time.sleep(0.02)
-            if todo and phase_of(folder) >= todo[0][0] and nodes(folder):
-                _, after, roles = todo.pop(0)
-                time.sleep(after)
-                there = nodes(folder)
-                for role in roles:
-                    if role in there:
-                        try:
-                            os.kill(there[role], signal.SIGKILL)
-                            kills += 1
-                        except ProcessLookupError:
-                            pass
-        if command.poll() is None:
-            command.send_signal(signal.SIGINT)
-        code = command.wait()
-    summary = folder / 'summary.json'
-    made = json.loads(summary.read_text()) if summary.is_file() else {}
-    digests = made.get('policy_sha256'), made.get('reward_model_sha256')
-    return kills, code, time.monotonic() - began, digests
+        return self.command.poll() is None
+
+    def kill(self, roles: Sequence[str]) -> None:
+        """Kill those of these roles that are there."""
+        there = nodes(self.folder)
+        for role in (role for role in roles if role in there):
+            self.states[state_of(self.folder, role)] += 1
+            try:
+                os.kill(there[role], signal.SIGKILL)
+            except ProcessLookupError:
+                self.states[state_of(self.folder, role)] -= 1
+        if TRAIN in roles:
+            self.states[TRAIN] += 1
+            self.command.kill()
+            self.command.wait()
+            while nodes(self.folder):  # the kernel has asked them to end
+                time.sleep(0.05)
+            self.command = self._start('--resume', str(self.folder))
+
+    def follow(self, planned: Iterator[Kill]) -> None:
+        """Kill by a schedule until the run has ended."""
+        end = time.monotonic() + LONGEST
+        for phases, after, roles in planned:
+            if not self._until(min(phase_of(self.folder) + phases, PHASES), end):
+                break
+            time.sleep(after)
+            if self.command.poll() is not None:
+                break
+            self.done.append(f'{phase_of(self.folder)}+{after:.1f}:{"+".join(roles)}')
+            self.kill(roles)
+        if self.command.poll() is None:
+            self.command.send_signal(signal.SIGINT)
+        self.command.wait()
+
+    @property
+    def kills(self) -> int:
+        """How many processes were killed."""
+        return self.states.total()
+
+    def digests(self) -> tuple[str | None, str | None]:
+        """Those of policy and reward model."""
+        path = self.folder / 'summary.json'
+        made = json.loads(path.read_text()) if path.is_file() else {}
+        return made.get('policy_sha256'), made.get('reward_model_sha256')
+
+
+def undisturbed(place: Path, settings: Settings, installed: bool) -> tuple[str | None, str | None]:
+    """The digests of a run in which nothing is killed."""
+    run = Run(place / 'undisturbed', settings, installed)
+    run.command.wait()
+    return run.digests()
 
 
 def main() -> None:
-    """Make all rows that are lacking."""
+    """Make rows until the file has so many kills."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--runs', type=int, default=6, help='runs, all kinds in turn')
+    parser.add_argument('--kills', type=int, default=1000, help='kills in all rows together')
+    parser.add_argument('--installed', action='store_true', help='start nodes as users do')
     given = parser.parse_args()
     rows = Rows(OUT, COLUMNS, 3)
-    undisturbed: dict[tuple[str, bool], tuple] = {}
-    for number in range(given.runs):
-        method, overlap = kind = KINDS[number % len(KINDS)]
-        if (method, overlap, number) in rows:
-            continue
-        settings = tiny(method=method, overlap=overlap, steps=STEPS)
-        with tempfile.TemporaryDirectory(prefix='codetr-kills-') as place:
-            config = Path(place) / 'config.yaml'
-            config.write_text(yaml.safe_dump(settings.model_dump(mode='json')))
-            if kind not in undisturbed:
-                *_, undisturbed[kind] = run(Path(place) / 'undisturbed', config, [])
-            planned = schedule(number, list(settings.roles))
-            kills, code, seconds, digests = run(Path(place) / 'run', config, planned)
-        shown = ' '.join(f'{p}+{after:.1f}:{"+".join(roles)}' for p, after, roles in planned)
-        same = digests == undisturbed[kind] and code == 0
-        rows.append((method, overlap, number, kills, shown, code, f'{seconds:.0f}', same))
+    expected: dict[tuple[str, bool], tuple[str | None, str | None]] = {}
+    number, kills = 0, sum(int(row['kills']) for row in rows.read())
+    try:
+        while kills < given.kills:
+            method, overlap = kind = KINDS[number % len(KINDS)]
+            seed, number = number, number + 1
+            if (*kind, seed) in rows:
+                continue
+            settings = tiny(method=method, overlap=overlap, steps=STEPS)
+            with tempfile.TemporaryDirectory(prefix='codetr-kills-') as place:
+                if kind not in expected:
+                    expected[kind] = undisturbed(Path(place), settings, given.installed)
+                began = time.monotonic()
+                roles = [*settings.roles, *([TRAIN] if seed % WITH_TRAIN == 4 else [])]
+                run = Run(Path(place) / 'run', settings, given.installed)
+                run.follow(schedule(seed, roles))
+                code = run.command.wait()
+                same = code == 0 and run.digests() == expected[kind]
+                if not same:
+                    print((Path(place) / 'run.log').read_text()[-3000:], file=sys.stderr)
+            seconds = f'{time.monotonic() - began:.0f}'
+            states = ' '.join(f'{name}={n}' for name, n in sorted(run.states.items()))
+            done = ' '.join(run.done)
+            rows.append((*kind, seed, run.kills, done, code, seconds, same, states))
+            kills += run.kills
+    finally:
+        forked.end_server()
 
 
 if __name__ == '__main__':

@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from started import check
 
 import machine
 import throughput
@@ -89,8 +90,7 @@ def idle(settings: Settings, seconds: float) -> Iterator[Row]:
             end = time.monotonic() + DEADLINE
             while len(committed) < settings.warmup_phases + 1:
                 watcher.poll(0.1)
-                if failed := processes.failed():
-                    raise SystemExit(launcher.end_of_log(failed.log))
+                check(processes)
                 if time.monotonic() > end:
                     raise SystemExit(f'{len(committed)} phases in {DEADLINE:g} s: too slow')
             stopped = next(n for n in processes.running() if n.role == 'learner').process

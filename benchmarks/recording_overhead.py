@@ -30,6 +30,8 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
+from started import check, first_failure
+
 import machine
 from codetr_ros.config import Settings, load
 from codetr_ros.processes import launcher
@@ -99,13 +101,12 @@ def one_run(settings: Settings, bag: bool, number: int) -> Run:
         ):
             processes.start(commands, folder / run_folder.LOGS, launcher.environment(settings))
             end = time.monotonic() + DEADLINE
-            while processes.running() and not processes.failed():
+            while processes.running() and not first_failure(processes):
                 watcher.poll(0.1)
                 recorder = max([recorder, *map(cpu_of, processes.running())])
                 if time.monotonic() > end:
                     raise SystemExit(f'a run took more than {DEADLINE:g} s')
-        if failed := processes.failed():
-            raise SystemExit(f'{failed.how_it_ended()}\n{launcher.end_of_log(failed.log)}')
+        check(processes)
         if clock.first is None or clock.last is None:
             raise SystemExit('the first commit or the last metrics did not arrive')
         sync, size = 0.0, 0.0

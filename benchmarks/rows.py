@@ -24,6 +24,11 @@ class Rows:
         else:
             path.write_text(','.join(columns) + '\n')
 
+    def read(self) -> list[dict[str, str]]:
+        """All rows of the file, by column."""
+        with self._path.open() as file:
+            return list(csv.DictReader(file))
+
     def __contains__(self, key: Sequence[object]) -> bool:
         return tuple(map(str, key)) in self._done
 

@@ -70,6 +70,8 @@ def run(folder: Path, method: str, overlap: bool, seed: int) -> list[object]:
         if reward := expected.get('reward'):
             ours = nodes.report('reward')['reward_model_sha256']
             same = same and ours == reward.reward_model_sha256
+    if not same:
+        print(*(nodes.log(name)[-4000:] for name in nodes.names), sep='\n', file=sys.stderr)
     words = ' '.join(f'{name}={code}' for name, code in codes.items() if code != 0) or 'all 0'
     return [*shown, *frames, f'{time.monotonic() - began:.0f}', words, same]
 

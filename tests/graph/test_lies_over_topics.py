@@ -30,7 +30,7 @@ from codetr_ros.records import (
 )
 from codetr_ros.records.roles import read_by
 from helpers.builders import tiny, transitions
-from helpers.lies import LIES, Liar
+from helpers.lies import FIRST, LIES, Liar
 from helpers.nodes import Nodes, domain
 from helpers.runs import finish, start, write
 
@@ -46,8 +46,6 @@ HEARD = (
     RunSpec, Presence, TaskSpec, Policy, Transitions, CompositeReward, Commit, StepRewards,
     EpisodeResult, TrueRewards, Metrics,
 )  # fmt: skip
-FIRST = (RunSpec, TaskSpec, Policy, Commit)
-"""What stays on the topic for whoever comes later."""
 NODES = ('record', 'reward', 'learner', 'evaluate')
 """Those that go on while the simulator is held."""
 

@@ -36,6 +36,8 @@ from codetr_ros.ros import messages, qos
 from helpers.builders import commit, policy, run, score, step_rewards, task_spec, transitions
 from helpers.nodes import NAMESPACE, Nodes, Witness
 
+FIRST = (RunSpec, TaskSpec, Policy, Commit)
+"""What stays on its topic for whoever comes later."""
 HEARD_BY_WITNESSES = (Presence, Commit, CompositeReward)
 MADE_UP = 'ab' * 32
 ANOTHER_KEY = bytes(32)

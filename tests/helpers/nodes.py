@@ -205,9 +205,7 @@ class Witness:
         """Listen until `found()` is true; what it returns."""
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
-            self.link.drain(0.05)
-            while self.link.inbox:
-                self.link.inbox.popleft()()
+            self.link.handle(0.05)
             if result := found():
                 return result
         logs = '\n'.join(
@@ -215,6 +213,12 @@ class Witness:
             for path in sorted((self._nodes.folder / run_folder.LOGS).glob('*.log'))
         )
         raise AssertionError(f'not within {PATIENCE:g} s; codes {self._nodes.codes()}\n{logs}')
+
+    def listen(self, seconds: float) -> None:
+        """Listen for a while."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            self.link.handle(min(left, 0.05))
 
     def follows(self, names: Collection[str]) -> bool:
         """Whether all that these nodes publish, of what is read here, arrives."""
