@@ -45,6 +45,8 @@ STEPS, PHASES = 4000, 20
 LONGEST = 900.0  # [s] for a run
 FLAGS = ('--no-film', '--restarts', '1000000', '--peer-deadline', '300')
 TRAIN = 'train'
+AT_THE_END = 3
+"""So often is killed once all phases are recorded, or the run would never end."""
 WITH_TRAIN = 5  # in every so manieth run `codetr train` is killed too
 
 Kill = tuple[int, float, list[str]]
@@ -156,8 +158,11 @@ class Run:
 
     def follow(self, planned: Iterator[Kill]) -> None:
         """Kill by a schedule until the run has ended."""
-        end = time.monotonic() + LONGEST
+        end, ending = time.monotonic() + LONGEST, 0
         for phases, after, roles in planned:
+            ending += phase_of(self.folder) >= PHASES
+            if ending > AT_THE_END:
+                break
             if not self._until(min(phase_of(self.folder) + phases, PHASES), end):
                 break
             time.sleep(after)
@@ -165,6 +170,8 @@ class Run:
                 break
             self.done.append(f'{phase_of(self.folder)}+{after:.1f}:{"+".join(roles)}')
             self.kill(roles)
+        while self.command.poll() is None and time.monotonic() < end:
+            time.sleep(0.1)
         if self.command.poll() is None:
             self.command.send_signal(signal.SIGINT)
         self.command.wait()

@@ -113,7 +113,8 @@ class Nodes:
         found = {}
         for node in self._processes.running():
             text = Path(f'/proc/{node.process.pid}/status').read_text()
-            found[node.name] = 1024 * int(re.findall(r'VmRSS:\s+(\d+) kB', text)[0])
+            if resident := re.findall(r'VmRSS:\s+(\d+) kB', text):  # else it has just ended
+                found[node.name] = 1024 * int(resident[0])
         return found
 
     def wait(self, *names: str) -> dict[str, int | None]:

@@ -2,8 +2,11 @@
 
 With a key of the run (`nodes.signing`) a message must be signed with it, and one process holds
 each role: the first that published as it. It holds it until it has finished, its process is gone,
-or it has been silent beyond the deadline; then a new start of the node may take its place. Without
-a key nobody is refused for who he is.
+or it has been silent beyond the deadline; then a new start of the node may take its place.
+
+Without a key nobody is refused for who he is: the sender of a message is what it states, and who
+reads one message can state the same. So a place that the first sender held would keep out nobody
+who lies, and would let a liar who comes first keep out the true node.
 """
 
 from collections.abc import Callable, Sized

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from codetr_ros.nodes.signing import VARIABLE
 from codetr_ros.records.roles import published_by
 from codetr_ros.ros.course import Course
 from codetr_ros.ros.gathering import IDLE, absent_or_unmatched
@@ -32,6 +33,11 @@ class Wiring:
         self.member.link.advertise(published_by(self.member.role), settings)
         self.open()
         self.log.info(f'run {run.run_id}: task {settings.task}, method {settings.method}')
+        if self.member.link.key is None:
+            self.log.warning(
+                f'there is no key of the run (environment variable {VARIABLE}): nobody is refused '
+                'for who he is'
+            )
         self.member.publish_presence()
 
     def open(self) -> None:
