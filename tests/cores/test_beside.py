@@ -22,6 +22,16 @@ def true_rewards(sequence, phase):
     )
 
 
+def test_true_rewards_that_were_lost_are_taken_when_they_are_sent_again():
+    beside = Beside(run(SETTINGS), SETTINGS, lambda: 4)
+    for sequence in (0, 3, 4, 1, 2):
+        beside.receive(true_rewards(sequence, 2))
+    assert beside.duplicated == {}, 'they came late, and for the first time'
+    for sequence in range(5):
+        beside.receive(true_rewards(sequence, 2))
+    assert beside.duplicated == {'true_rewards': 5}
+
+
 def test_true_rewards_may_be_late_by_any_number_of_phases():
     beside = Beside(run(SETTINGS), SETTINGS, lambda: 4)
     for sequence, phase in ((0, 0), (1, 1), (2, 4)):

@@ -166,7 +166,7 @@ class Liar(Witness):
             place = self.rng.randrange(4, len(data))
             return data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :]
         others = [other for other in TOPICS if other is not kind and self._heard[other]]
-        return self.rng.choice(self._heard[self.rng.choice(others)])
+        return self.rng.choice(self._heard[self.rng.choice(others)]) if others else self._junk()
 
     def _junk(self) -> bytes:
         return self.rng.randbytes(self.rng.randrange(1, 400))

@@ -10,19 +10,22 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rosbags.highlevel import AnyReader
 
 from codetr_ros.bags.definitions import decode
+from codetr_ros.nodes.outbox import Outbox
 from codetr_ros.records import (
     Commit,
     CompositeReward,
     Policy,
     RecordError,
     Transitions,
+    TrueRewards,
 )
 from codetr_ros.ros.fetch import unpack
 from codetr_ros.ros.membership import Membership
+from codetr_ros.ros.resend import serve_outbox
 from codetr_ros.ros.signals import Stop
 from codetr_ros.runs import folder as run_folder
 from helpers.builders import policy, score, step_rewards, task_spec, tiny, transitions
-from helpers.commits import committed
+from helpers.commits import chunk, committed
 from helpers.playing import NAMESPACE, everybody_matched, output, process
 
 
@@ -86,6 +89,41 @@ def test_a_phase_that_a_node_lacks_is_fetched_from_the_recorder_and_the_loss_is_
 
 
 @pytest.mark.slow
+def test_what_was_lost_of_an_early_phase_is_asked_for_though_later_ones_are_whole(play, tmp_path):
+    """A network that was cut: what no commit names, such as true rewards, is noticed late."""
+    phases = 6
+    play = play(settings=tiny(steps=30, phase_steps=5, warmup_steps=30, evaluate_every=0))
+    sim, learner = play.links['sim'], play.links['learner']
+    outbox = Outbox(phase_steps=5, phases=None)
+    serve_outbox(sim, 'run', outbox)
+    with process('record', f'folder:={tmp_path}', 'peer_deadline:=30.0') as node:
+        play.until(lambda: everybody_matched(play), node)
+        sim.publish(task_spec())
+        for phase in range(phases):
+            learner.publish(policy(phase=phase, steps=np.array([5], np.uint32)))
+            rewards = np.arange(5, dtype=np.float32)
+            steps = chunk(phase)
+            true = TrueRewards(
+                run_id='run', source='sim', sequence=phase, phase=phase, episode=0,
+                first_step=steps.first_step, rewards=rewards,
+            )  # fmt: skip
+            outbox.keep(steps)
+            outbox.keep(true)
+            sim.publish(steps)
+            if phase:  # those of the first phase do not arrive
+                sim.publish(true)
+            play.until(lambda n=phase: len(play.messages('Commit', 'learner')) > n, node)
+        play.claimed = {'true_rewards': 1}
+        play.finished = True
+        play.until(lambda: node.poll() is not None)
+        said = output(node)
+    assert node.returncode == 0, said
+    assert '1 messages of /r/sim had not arrived: it has sent them again' in said
+    report = json.loads(run_folder.report_path(tmp_path, 'record', 'record').read_text())
+    assert report['recorded']['true_rewards'] == phases
+    assert report['fetched'] == {'true_rewards': 1}
+
+
 def test_a_node_gives_up_on_what_was_lost_for_good_naming_topic_and_count(play):
     play = play(settings=settings(), roles=('learner', 'sim', 'record'))
     with process('deaf', 'peer_deadline:=7.0') as deaf:  # and nobody offers to send anything again

@@ -2,7 +2,7 @@
 their source is announced.
 """
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable
 
 from codetr_ros.config import Settings
@@ -20,6 +20,9 @@ from codetr_ros.records import (
     describe,
 )
 from codetr_ros.records.checks import check_run
+
+MOST_LACKING = 100_000
+"""Numbers of true rewards that are remembered as lacking, of each source."""
 
 
 class Early:
@@ -79,6 +82,7 @@ class Beside:
         self._settings = settings
         self._committed = committed
         self._due: Counter[str] = Counter()  # next sequence number of true rewards, by source
+        self._lacking: defaultdict[str, set[int]] = defaultdict(set)  # those below it
         self.duplicated: Counter[str] = Counter()
 
     def receive(self, record: Record) -> None:
@@ -109,9 +113,16 @@ class Beside:
         # they may be late by any number of phases: no commit waits for them
         self._within(record, record.phase, 0, first + settings.ahead, 'phase')
         self._within(record, len(record.rewards), 1, settings.phase_steps, 'length of rewards')
+        lacking = self._lacking[record.source]
+        if record.sequence in lacking:  # lost on the way, and sent again
+            lacking.remove(record.sequence)
+            return
         if record.sequence < due:
             self.duplicated[TOPICS[TrueRewards]] += 1
             return
         most = due + (settings.ahead + 1) * settings.phase_steps
         self._within(record, record.sequence, due, most, 'sequence')
+        lacking.update(range(due, record.sequence))
+        while len(lacking) > MOST_LACKING:
+            lacking.remove(min(lacking))
         self._due[record.source] = record.sequence + 1

@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -283,13 +283,16 @@ class Traffic:
             reason = shown(str(error), LONGEST_LINE)
             self._log.error(f'refused on {topic!r} (number {n}): {reason}')
 
-    def lost(self) -> dict[str, int]:
+    def lost(self, topics: Collection[str] | None = None) -> dict[str, int]:
         """Counts of the records that peers published a while ago, according to their presence,
         and that never arrived, not even when fetched again.
+
+        Args:
+            topics: those that are looked at; None: what the core takes in.
         """
         if self.lost_for_good is not None:
             return self.lost_for_good
-        wanted = {TOPICS[kind] for kind in self.core.subscribes}
+        wanted = [TOPICS[k] for k in self.core.subscribes] if topics is None else topics
         lost = self.ledger.lost(self.received + self.recovered, self._clock())
         return {topic: n for topic, n in lost.items() if topic in wanted}
 

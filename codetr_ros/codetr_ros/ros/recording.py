@@ -49,6 +49,7 @@ from codetr_ros.ros.wiring import Wiring
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.reports import BagReport
 
+RECORDED_TOPICS = [TOPICS[kind] for kind in RECORDED]
 CATCH_UP = 10.0
 """The most seconds that a recorder which was held takes to ask others for what it has missed. They
 keep it for some phases only, so that it commits none meanwhile."""
@@ -159,7 +160,8 @@ class Recording(Wiring):
         except RecordError as error:
             self.member.traffic.refuse(kind, error)
             return False
-        self.member.traffic.recovered[TOPICS[kind]] += new
+        if new:
+            self.member.traffic.recovered[TOPICS[kind]] += 1
         return new
 
     def _knows(self, kind: type, raw: bytes) -> bool:
@@ -266,7 +268,7 @@ class Recording(Wiring):
         self._leave_out()
         self._early = [record for record in self._early if core.comes_early(record)][-1:]
         lost = [TOPICS[type(record)] for record in self._early]
-        self._ask_again([*lost, *self.member.traffic.lost()])
+        self._ask_again([*lost, *self.member.traffic.lost(RECORDED_TOPICS)])
         return super().waits()
 
     def _leave_out(self) -> None:
@@ -293,7 +295,7 @@ class Recording(Wiring):
     def _ask_again(self, lost: Collection[str]) -> None:
         """Ask those who publish on these topics for what was lost."""
         roles = {role for topic in lost for role in WRITERS[topic]}
-        self._sweeper.ask(self._nodes(roles))
+        self._sweeper.ask(self._nodes(roles), lacking=True)
         self._sweeper.check()
 
     def settled(self, seconds: float) -> bool:

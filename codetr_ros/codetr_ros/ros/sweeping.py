@@ -10,7 +10,9 @@ from codetr_ros.ros.fetch import NEWEST, Answer, Asker, service_of
 from codetr_ros.ros.link import Link
 
 UNNEWS = 3
-"""Phases of a node with nothing new in them, after which it is not asked for earlier ones."""
+"""Phases of a node with nothing new in them, after which it is not asked for earlier ones, unless
+something is known to be lacking.
+"""
 
 TakeAgain = Callable[[type, bytes], bool]
 """Takes the bytes of a message that was sent again; returns whether it was new."""
@@ -38,18 +40,23 @@ class Sweeper:
         self._askers: dict[str, Asker] = {}
         self._wanted: dict[str, float] = {}  # nodes to be asked, and when at the earliest
         self._asked: dict[str, float] = {}  # when each has answered last
+        self._thorough: set[str] = set()  # nodes that are to be asked for all that they keep
         self._present: str | None = None  # the node that is asked
         self._phases: list[list[tuple[type, bytes]]] = []  # what it has sent, newest first
         self._news = 0  # phases since one had something new
 
-    def ask(self, nodes: Iterable[str]) -> None:
+    def ask(self, nodes: Iterable[str], lacking: bool = False) -> None:
         """Ask these nodes, each as soon as it offers to answer, and not twice in `AGAIN` seconds.
 
         Args:
             nodes: full names.
+            lacking: whether something that they have published is known to be lacking: of any
+                phase, so that they are asked for all that they keep.
         """
         for node in nodes:
             if node != self._present:
+                if lacking:
+                    self._thorough.add(node)
                 self._wanted.setdefault(node, self._asked.get(node, -AGAIN) + AGAIN)
 
     @property
@@ -83,7 +90,8 @@ class Sweeper:
         self._phases.append(answer.messages)
         new = any(not self._known(kind, data) for kind, data in answer.messages)
         self._news = 0 if new else self._news + 1
-        if self._news < UNNEWS and answer.phase > 0:
+        goes_on = self._news < UNNEWS or self._present in self._thorough
+        if goes_on and answer.phase > 0:
             self._askers[self._present].ask(answer.phase - 1, self._answered)
         else:
             self._end()
@@ -92,6 +100,7 @@ class Sweeper:
         node, phases = self._present, self._phases
         assert node is not None
         self._present, self._phases = None, []
+        self._thorough.discard(node)
         self._asked[node] = time.monotonic()
         sent = [message for messages in reversed(phases) for message in messages]
         if new := sum(self._take(kind, data) for kind, data in sent):
