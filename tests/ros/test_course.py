@@ -12,10 +12,10 @@ class Log(list):
     info = list.append
 
 
-def a_course(**changes):
+def a_course(counts=True, **changes):
     clock, log = Clock(), Log()
     settings = tiny(steps=1200, phase_steps=200, evaluate_every=200, **changes)
-    return Course(settings, log, clock), clock, log
+    return Course(settings, log, clock, counts), clock, log
 
 
 def ended(phase):
@@ -67,3 +67,11 @@ def test_an_evaluation_is_a_line_once_all_its_episodes_are_there():
         course.note(episode(step=400, episode=number, true_return=true))
     course.note(episode(purpose='random', step=0))
     assert log == ['evaluated after 400 of 1200 steps: true return 20.0, 2 episodes']
+
+
+def test_a_node_that_publishes_no_metrics_states_nothing_of_phases_that_it_does_not_count():
+    course, clock, log = a_course(counts=False)
+    for _ in range(11):
+        clock.now += 1
+        course.tick("waits for a judgement of 'ann'")
+    assert log == ["waits for a judgement of 'ann'"]

@@ -4,6 +4,7 @@ What a browser sends is checked here like a message, and again by the desk: type
 Nothing of it is executed, and the page shows it as text only.
 """
 
+import asyncio
 import math
 import re
 from collections.abc import Callable, Collection
@@ -80,6 +81,7 @@ class ScoringPage:
         self._desk = desk
         self._points = points
         self._frames = frames
+        self._drawing = asyncio.Lock()
         self._seen = -1
         self.feed = Feed()
         self.feed.publish('scale', [points.lowest, points.highest])
@@ -126,10 +128,7 @@ class ScoringPage:
         except ScoringError as error:
             return PlainTextResponse(str(error), 422)
         if sent.get('frames') is True:
-            drawn = None
-            if self._frames is not None and self._desk.seen.curves(segment) is not None:
-                drawn = await run_in_threadpool(self._frames, segment)
-            return JSONResponse({'frames': drawn or []})
+            return JSONResponse({'frames': await self._drawn(request, segment)})
         curves = self._desk.seen.curves(segment)
         if curves is None:
             return PlainTextResponse('the steps of this segment are not held any more', 404)
@@ -144,6 +143,16 @@ class ScoringPage:
                 'drawn': self._frames is not None,
             }
         )
+
+    async def _drawn(self, request: Request, segment: Segment) -> list[str]:
+        """Pictures of a segment, one segment at a time; none if whoever asked for them has gone on
+        to another one before it was their turn.
+        """
+        async with self._drawing:
+            gone = await request.is_disconnected()
+            if gone or self._frames is None or self._desk.seen.curves(segment) is None:
+                return []
+            return await run_in_threadpool(self._frames, segment) or []
 
 
 def _curves(values: Any, every: int) -> list[list[float]]:

@@ -19,17 +19,23 @@ class Course:
         settings: the settings of the run.
         log: the node's logger.
         clock: seconds, never going back.
+        counts: whether the node publishes metrics, by which phases are counted. Of another one it
+            is not known how far the run has come.
     """
 
     def __init__(
-        self, settings: Settings, log: Any, clock: Callable[[], float] = time.monotonic
+        self,
+        settings: Settings,
+        log: Any,
+        clock: Callable[[], float] = time.monotonic,
+        counts: bool = True,
     ) -> None:
         self._settings = settings
         self._log = log
         self._clock = clock
         self._logged = float('-inf')  # when a line was logged
         self._quiet_since: float | None = None  # or since the node began to work
-        self._where = f'no phase of {settings.phases} is done'
+        self._where = f'no phase of {settings.phases} is done' if counts else ''
         self._results: list[EpisodeResult] = []
 
     def note(self, record: Record) -> None:
@@ -65,7 +71,7 @@ class Course:
         if self._quiet_since is None:
             self._quiet_since = now
         elif now - self._quiet_since >= AT_MOST:
-            self._line(f'{doing}; {self._where}')
+            self._line('; '.join(filter(None, (doing, self._where))))
 
     def _line(self, text: str, always: bool = False) -> None:
         now = self._clock()

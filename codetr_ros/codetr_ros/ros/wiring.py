@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from codetr_ros.nodes.signing import VARIABLE
+from codetr_ros.records import TOPICS, Metrics
 from codetr_ros.records.roles import published_by
 from codetr_ros.ros.course import Course
 from codetr_ros.ros.gathering import IDLE, absent_or_unmatched
@@ -25,7 +26,8 @@ class Wiring:
         self.member = member
         self.joined = joined
         self.log = member.log
-        self._course = Course(joined.settings, member.log)
+        counts = TOPICS[Metrics] in published_by(member.role)
+        self._course = Course(joined.settings, member.log, counts=counts)
 
     def enter(self) -> None:
         """Open the topics, and publish that the node has joined."""

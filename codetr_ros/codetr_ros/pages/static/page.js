@@ -48,12 +48,16 @@ export function follow(handlers, onState = () => {}) {
   return source;
 }
 
-/** Send a value to the server; resolves to its answer, or throws an Error with its words. */
-export async function send(path, value) {
+/**
+ * Send a value to the server; resolves to its answer, or throws an Error with its words. `signal`
+ * may abort it.
+ */
+export async function send(path, value, signal) {
   const answer = await fetch(path, {
     method: 'POST',
     headers: { 'Content-Type': 'application/json' },
     body: JSON.stringify(value),
+    signal,
   });
   if (!answer.ok) throw new Error(await answer.text());
   return answer.json();

@@ -27,6 +27,7 @@ class Shown {
     this.observations = new Chart(observations, 'what the robot saw', { xLabel: 'step', height: 160 });
     this.actions = new Chart(actions, 'what it did', { xLabel: 'step', height: 120 });
     this.timer = null;
+    this.abandon = new AbortController();
   }
 
   async show(segment) {
@@ -34,7 +35,20 @@ class Shown {
     this.segment = segment;
     clearInterval(this.timer);
     this.picture.hidden = true;
-    const curves = await send('/segment', { segment });
+    // pictures take seconds: those of a segment that nobody looks at any more are not drawn
+    this.abandon.abort();
+    this.abandon = new AbortController();
+    try {
+      await this.fetch(segment, this.abandon.signal);
+    } catch (error) {
+      if (!same(segment, this.segment)) return;
+      this.segment = null; // it is asked for again
+      throw error;
+    }
+  }
+
+  async fetch(segment, signal) {
+    const curves = await send('/segment', { segment }, signal);
     if (!same(segment, this.segment)) return;
     const curve = (name) => (values, i) => ({
       name: `${name} ${i + 1}`,
@@ -44,7 +58,7 @@ class Shown {
     this.observations.show(curves.observations.map(curve('observation')));
     this.actions.show(curves.actions.map(curve('action')));
     if (!curves.drawn) return;
-    const { frames } = await send('/segment', { segment, frames: true });
+    const { frames } = await send('/segment', { segment, frames: true }, signal);
     if (!same(segment, this.segment) || !frames.length) return;
     let at = 0;
     this.picture.alt = `the robot, ${words(segment)}`;
@@ -69,13 +83,19 @@ function due() {
   return rest.slice(0, state.comparing ? 2 : 1);
 }
 
+function judged(segment) {
+  return state.desk.given.some((given) => same(given.segment, segment) || same(given.other, segment));
+}
+
 function render() {
   const { desk } = state;
   if (!desk) return;
   write(at('title'), `${desk.task}: score segments as ${desk.scorer}`);
   const phase = desk.phase < 0 ? 'no phase is done yet' : `phase ${desk.phase + 1} of ${desk.phases} is done`;
   write(at('state'), desk.finished ? 'The run has ended: nothing more is learnt.' : `The run goes on without you; ${phase}.`);
-  const kept = state.shown.length && state.shown.every((each) => [...desk.waiting, state.correcting].some((w) => same(w, each)));
+  // what somebody looks at stays, though the run asks for others by now: else a click would be for
+  // another segment than the one that was looked at
+  const kept = state.shown.length && !state.shown.some((each) => !same(each, state.correcting) && judged(each));
   const wanted = state.comparing && !state.correcting ? 2 : 1;
   if (!kept || state.shown.length !== wanted) state.shown = due();
   const comparing = state.shown.length === 2;
@@ -132,8 +152,12 @@ function renderGiven() {
   at('given').replaceChildren(...rows);
 }
 
+const waits = (segment) => [...state.desk.waiting, state.correcting].some((each) => same(each, segment));
+
 function refuse(error) {
   write(at('refused'), error.message);
+  // what is not asked for any more may not be held any more either: then nobody can judge it
+  if (!state.shown.every(waits)) state.shown = [];
 }
 
 async function judge(statement) {
