@@ -1,6 +1,6 @@
-"""The reward node, which no transitions reach: as if the network had lost them all."""
+"""The reward node, which no transitions, or no commits, reach: the network has lost them all."""
 
-from codetr_ros.records import Transitions
+from codetr_ros.records import Commit, Transitions
 from codetr_ros.ros.node import run_node
 from codetr_ros.ros.wiring import Wiring
 from reward_node.reward import load
@@ -14,3 +14,13 @@ class Deaf(Wiring):
 
 def main() -> int:
     return run_node('reward', 'reward', load, wire=Deaf)
+
+
+class Uncommitted(Wiring):
+    def take(self, kind, message):
+        if kind is not Commit:
+            super().take(kind, message)
+
+
+def uncommitted() -> int:
+    return run_node('reward', 'reward', load, wire=Uncommitted)

@@ -20,6 +20,7 @@ MODULES = {
     'reward': 'reward_node.reward',
     'score': 'codetr_ros.ros.score',
     'deaf': 'helpers.deaf',
+    'uncommitted': 'helpers.deaf:uncommitted',
     'imports': 'helpers.slow_import',
     'compiles': 'helpers.slow_import:compiling',
 }

@@ -89,6 +89,26 @@ def test_a_phase_that_a_node_lacks_is_fetched_from_the_recorder_and_the_loss_is_
 
 
 @pytest.mark.slow
+def test_a_commit_that_was_lost_is_asked_for_though_none_follows(play, tmp_path):
+    play = play(settings=settings(), roles=('learner', 'sim'))
+    with (
+        process('record') as record,
+        process('uncommitted', f'folder:={tmp_path}', 'peer_deadline:=30.0') as node,
+    ):
+        play.until(lambda: read_by(play, 'record', 'reward') and waits_for_a_phase(play), node)
+        publish_a_phase(play)
+        play.until(lambda: play.messages('StepRewards', 'learner'), node)
+        play.until(lambda: [p for p in play.presence_of('reward') if p.finished])
+        play.finished = True
+        play.until(lambda: node.poll() is not None and record.poll() is not None)
+        said = output(node)
+    assert node.returncode == 0, said
+    assert 'the commit of phase 0 was lost: it came again' in said
+    report = json.loads(run_folder.report_path(tmp_path, 'reward', 'reward').read_text())
+    assert report['lost'] == {}
+
+
+@pytest.mark.slow
 def test_what_was_lost_of_an_early_phase_is_asked_for_though_later_ones_are_whole(play, tmp_path):
     """A network that was cut: what no commit names, such as true rewards, is noticed late."""
     phases = 6

@@ -189,7 +189,7 @@ class Playback:
         commits: completes the commits; None: they go out as they were recorded.
     """
 
-    missing = unlabelled = None  # it takes no phases in
+    missing = unlabelled = uncommitted = None  # it takes no phases in
     due = None
 
     def __init__(

@@ -77,6 +77,13 @@ class Consumer(Part, ABC):
         due = self._intake.due
         return due if due <= self._committed else self._intake.missing
 
+    @property
+    def uncommitted(self) -> int | None:
+        """The phase whose commit comes next; None if it has come, or there is none."""
+        commits = self._intake.commits
+        more = commits.next < self._settings.phases and not commits.of(commits.next)
+        return commits.next if more and self.missing is None else None
+
     def catch_up(self, newest: int) -> None:
         """Note that phases up to `newest` are committed, whether their commits have come or not:
         those that have not been taken in are then missing.

@@ -29,6 +29,10 @@ class Core(Protocol[Given_co]):
         """A committed phase that is incomplete; None if there is none."""
 
     @property
+    def uncommitted(self) -> int | None:
+        """The phase whose commit comes next; None if none is awaited here."""
+
+    @property
     def due(self) -> int | None:
         """The next phase to be finished here; None if there are none here."""
 
@@ -81,6 +85,11 @@ class Part:
     @property
     def missing(self) -> int | None:
         """A committed phase that is incomplete; None if there is none."""
+        return None
+
+    @property
+    def uncommitted(self) -> int | None:
+        """The phase whose commit comes next; None if none is awaited here."""
         return None
 
     @property

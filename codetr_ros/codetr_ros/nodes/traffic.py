@@ -256,17 +256,23 @@ class Traffic:
         self.admission.check_again(record, sender)
         return record
 
-    def take_again(self, kind: type, data: bytes) -> None:
-        """Take the bytes of a message that was fetched again."""
+    def take_again(self, kind: type, data: bytes, lost: bool = False) -> None:
+        """Take the bytes of a message that was fetched again.
+
+        Args:
+            kind: what it is.
+            data: the bytes.
+            lost: whether it is certain that it was lost, though it is a commit.
+        """
         try:
-            self.receive_again(self.fetched(kind, data))
+            self.receive_again(self.fetched(kind, data), lost)
         except RecordError as error:
             self.refuse(kind, error)
 
-    def receive_again(self, record: Record) -> None:
+    def receive_again(self, record: Record, lost: bool = False) -> None:
         """Hand over a record that was fetched again; one that is new was lost before."""
         # a node that fetches what a commit names has the commit
-        if self.receive(record) and not isinstance(record, Commit):
+        if self.receive(record) and (lost or not isinstance(record, Commit)):
             self.recovered[TOPICS[type(record)]] += 1
 
     def refuse(self, what: type | str, error: Exception) -> None:

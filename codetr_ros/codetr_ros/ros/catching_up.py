@@ -19,7 +19,7 @@ OF_PHASES = (Transitions, CompositeReward, Preference, Commit)
 
 RECORDER = 'the recorder'
 
-TakeAgain = Callable[[type, bytes], object]
+TakeAgain = Callable[..., object]
 """Takes the bytes of a message that was fetched again."""
 
 
@@ -30,7 +30,7 @@ class Fetcher:
         link: the node's connection.
         run_id: the run.
         peers: the other nodes.
-        take: takes each message that comes.
+        take: takes each message that comes, as `Traffic.take_again` does.
 
     Attributes:
         behind: phases up to this one were committed when the node joined: nothing of them is
@@ -45,8 +45,8 @@ class Fetcher:
         self._take = take
         self._recorder = Asker(link, SERVICE, run_id)
         self._reward: tuple[str, Asker] | None = None
-        self._phases, self._labels = Fetching(), Fetching()
-        self._offered = Offered()
+        self._phases, self._labels, self._commits = Fetching(), Fetching(), Fetching()
+        self._offered, self._committed = Offered(), Offered()
         self._kinds: tuple[type, ...] = ()  # that the core takes in
         self._fetched: Callable[[int], None]  # lets the core know that a phase was sent again
         self.behind = -1
@@ -59,6 +59,10 @@ class Fetcher:
             assert missing is not None
             self._kinds, self._fetched = core.subscribes, core.fetched
             self._ask_recorder(missing)
+        uncommitted = core.uncommitted
+        if self._commits.due(uncommitted, now):
+            assert uncommitted is not None
+            self._ask_commit(uncommitted)
         behind = unlabelled is not None and unlabelled <= self.behind
         if self._labels.due(unlabelled, now, behind):
             assert unlabelled is not None
@@ -74,6 +78,20 @@ class Fetcher:
             self._log.warning(f'phase {phase} is incomplete: asking the recorder for it')
         kinds = [type_name(kind) for kind in OF_PHASES if kind in self._kinds]
         self._recorder.ask(phase, lambda answer: self._arrived(RECORDER, phase, answer), kinds)
+
+    def _ask_commit(self, phase: int) -> None:
+        """Ask for the commit that is waited for: if it was lost, none may follow that shows it."""
+        if self._recorder.ready:
+            kinds = [type_name(Commit)]
+            self._recorder.ask(phase, lambda answer: self._offered_commit(phase, answer), kinds)
+
+    def _offered_commit(self, phase: int, answer: Answer) -> None:
+        if answer.reason:
+            return  # it has not committed the phase yet
+        if self._committed.lost(phase, time.monotonic()):
+            self._log.warning(f'the commit of phase {phase} was lost: it came again')
+            for kind, data in answer.messages:
+                self._take(kind, data, lost=True)
 
     def _ask_reward(self, phase: int) -> None:
         asker = self._reward_node()
