@@ -126,6 +126,10 @@ class Liar(Witness):
         """Publish a record that is not signed."""
         self.tell(type(record), self._message(record, self.link.instance))
 
+    def tell_again(self, kind: type) -> None:
+        """Publish the newest message of a topic once more, as it came."""
+        self.tell(kind, self._heard[kind][-1])
+
     def tell_something(self, *kinds: type) -> None:
         """Publish a lie on the topic of one of these kinds of records: one that is made up, or
         something that was heard.

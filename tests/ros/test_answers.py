@@ -1,10 +1,18 @@
 """Signed answers of `fetch_phase` fit one request, and nothing of them can be changed."""
 
+import time
+
 import numpy as np
 import pytest
+import rclpy
 from codetr_msgs.srv import FetchPhase
 
-from codetr_ros.ros.fetch import answer_signature
+from codetr_ros.bags.definitions import decode
+from codetr_ros.nodes.outbox import Outbox
+from codetr_ros.ros.fetch import NEWEST, Asker, answer_signature
+from codetr_ros.ros.link import Link
+from codetr_ros.ros.resend import serve_outbox
+from helpers.builders import transitions
 
 KEY, SERVICE = bytes(range(32)), '/r/fetch_phase'
 REQUEST = {'run_id': 'run', 'phase': 3, 'kinds': ['a'], 'part': 1, 'nonce': np.ones(16, np.uint8)}
@@ -45,3 +53,49 @@ def test_every_field_but_the_name_for_logs_is_covered():
     asked = set(FetchPhase.Request.get_fields_and_field_types()) - {'requester'}
     answered = set(FetchPhase.Response.get_fields_and_field_types()) - {'signature'}
     assert (asked, answered) == (set(REQUEST), set(RESPONSE))
+
+
+@pytest.fixture
+def links(ros_domain):
+    """Who asks, who has something to answer, and who has no key."""
+    rclpy.init(args=['test', '--ros-args', '-r', '__ns:=/r'])
+    made = [Link(name) for name in ('asker', 'sim', 'liar')]
+    for link in made[:2]:
+        link.key = KEY
+    yield made
+    for link in made:
+        link.close()
+    rclpy.try_shutdown()
+
+
+def test_a_false_answer_is_refused_and_the_true_one_awaited(links):
+    asker, sim, liar = links
+    outbox, refused, answers, asked = Outbox(5, None), [], [], []
+    outbox.keep(transitions())
+    asker.refuse = lambda what, error: refused.append(str(error))
+
+    def lie(request, response):
+        asked.append(request.phase)
+        response.found, response.phase, response.parts = True, 7, 1
+        return response
+
+    liar.node.create_service(FetchPhase, 'sim/fetch_phase', lie)
+    serve_outbox(sim, 'run', outbox)
+    question = Asker(asker, '/r/sim/fetch_phase', 'run')
+    asker.handle(0.05)
+    end, wanted = time.monotonic() + 60.0, 0
+    while not refused and time.monotonic() < end:
+        if question.ready and not question.busy:
+            wanted += 1
+            question.ask(NEWEST, answers.append)
+        liar.handle(0.02)  # it answers first
+        for link in (sim, asker):
+            link.handle(0.02)
+    while len(answers) < wanted and time.monotonic() < end:
+        for link in links:
+            link.handle(0.02)
+    assert "an answer of '/r/sim/fetch_phase' to the question for phase" in refused[0]
+    assert asked
+    assert {answer.phase for answer in answers} == {0}
+    (kind, data) = answers[-1].messages[0]
+    assert decode(kind, data).observations.tobytes() == transitions().observations.tobytes()
