@@ -49,6 +49,28 @@ def test_policies_that_nobody_can_have_published_yet_are_refused(simulator):
     assert (core.due, behind.asks, dict(traffic.refused)) == (0, False, {'policy': 1})
 
 
+def test_policies_that_it_has_caught_up_with_since_they_came_are_taken(simulator):
+    core, traffic, behind = simulator()
+    for phase in range(3):  # it takes nothing out of those that wait: 2 cannot have begun
+        traffic.receive(permission(phase))
+    core.pass_over(2)  # as if it had run the phases before
+    assert behind.asks
+    behind.answered(1)
+    assert (core.lacks_permission, behind.asks) == (False, False)
+    assert not traffic.refused
+
+
+def test_of_policies_that_are_held_those_are_refused_that_are_too_early_still(simulator):
+    core, traffic, behind = simulator()
+    for phase in (2, 50):
+        traffic.receive(permission(phase))
+    core.pass_over(1)
+    behind.answered(0)
+    core.pass_over(2)
+    assert (core.lacks_permission, behind.asks) == (False, False)
+    assert traffic.refused == {'policy': 1}
+
+
 def test_nothing_is_asked_while_the_next_policy_is_there(simulator):
     _, traffic, behind = simulator()
     traffic.receive(permission(5))

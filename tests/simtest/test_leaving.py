@@ -1,5 +1,7 @@
 """Simulators that fall silent are left out, join again, and the bag says what was learnt from."""
 
+from dataclasses import replace
+
 import pytest
 
 from codetr_ros.simtest.run import carry_out
@@ -40,3 +42,14 @@ def test_two_simulators_join_a_running_run_of_two_by_their_names_alone():
     assert ended.errors == {}
     for name in names:
         assert any(f'{name} ' in line and 'publishes Transitions' in line for line in ended.trace)
+
+
+@pytest.mark.parametrize(('seed', 'stall'), [(TWO, (1.5, 8.0)), (TWO + 2, (1.5, 9.0))])
+def test_a_simulator_that_is_there_again_when_the_run_is_over_catches_up_and_ends(seed, stall):
+    """It then runs the phase that it was left out of, and has the last permission by then."""
+    planned = leaving(seed, {'sim_2': [stall]})
+    planned = replace(planned, settings=planned.settings.changed({'steps': 24}))
+    ended = carry_out(planned, kept=10_000)
+    assert ended.failures == []
+    assert ended.errors == {}
+    assert happened(ended, 'leaves sim_2 out') == 1

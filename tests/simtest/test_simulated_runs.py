@@ -15,6 +15,8 @@ from codetr_ros.simtest.process import Pace
 from codetr_ros.simtest.run import carry_out, simulate
 
 QUICK, MANY = range(24), range(24, 200)
+FOUND = (475,)
+"""Seeds beyond those that once failed."""
 
 
 def failures(seeds):
@@ -23,6 +25,10 @@ def failures(seeds):
 
 def test_a_few_seeds_end_as_if_nothing_had_happened_or_by_name():
     assert failures(QUICK) == {}
+
+
+def test_seeds_that_once_failed_end_as_if_nothing_had_happened_or_by_name():
+    assert failures(FOUND) == {}
 
 
 @pytest.mark.slow

@@ -17,7 +17,8 @@ class Behind:
     """Holds such policies until the recorder has answered which phase is committed.
 
     Either the simulator was left out meanwhile, and phases were committed without it: then it goes
-    on behind them. Or who published the policies had no right to: then they are refused.
+    on behind them. Or it has caught up by itself since they came: then it takes them. Or who
+    published the policies had no right to: then they are refused.
 
     Args:
         traffic: hands records to the core.
@@ -52,11 +53,16 @@ class Behind:
             newest: the last committed phase; None if there is none.
         """
         held, self._held = self._held, {}
-        if newest is None or newest < self._core.due:
-            for _, error in held.values():
-                self._traffic.refuse(Policy, error)
-            return
-        self._core.pass_over(newest + 1)
+        passed = newest is not None and newest >= self._core.due
+        if newest is not None and passed:
+            self._core.pass_over(newest + 1)
         for phase, (policy, _) in sorted(held.items()):
-            if phase > newest:
+            if phase >= self._core.due:  # the simulator may have gone on since it came
                 self._traffic.receive(policy)
+        if not passed:
+            self._refuse_all()
+
+    def _refuse_all(self) -> None:
+        held, self._held = self._held, {}
+        for _, error in held.values():
+            self._traffic.refuse(Policy, error)
