@@ -1,7 +1,8 @@
 """Cuts the bag of a run back to its last commit, so that the run can go on from there.
 
 What nobody has learnt from is left out: all that lies behind the last commit, and what was early,
-of phases without a commit. It is made again. The commit and all before it stay byte for byte.
+of phases without a commit. It is made again. The commit and all before it stay byte for byte. What
+no commit waits for may have come late: it stays too, if it is in the file of the last commit.
 """
 
 import os
@@ -33,6 +34,7 @@ from codetr_ros.records.fields import RECORD_TYPES, type_name
 from codetr_ros.system.files import sync_folder
 
 _OF_PHASES = (Policy, Transitions, TrueRewards, StepRewards, Metrics)
+_MAY_BE_LATE = (TrueRewards, EpisodeResult, Metrics)
 
 
 @dataclass
@@ -133,12 +135,22 @@ class _Kept:
             message: of a file up to that with the commit.
             number: its own in the file, from 1.
         """
-        if message.place.file == self.file and number > self._at:
-            return False
         kind = RECORD_TYPES.get(message.channel.type)
+        if message.place.file == self.file and number > self._at:
+            return kind in _MAY_BE_LATE and self._came_late(decode(kind, message.data))
         if kind is None or kind not in (*_OF_PHASES, CompositeReward, EpisodeResult):
             return True
         return self._belongs(decode(kind, message.data))
+
+    def _came_late(self, record: Record) -> bool:
+        """Whether a record behind the commit is of a simulator and of a phase that is committed:
+        the simulator goes on behind it, and does not publish it again.
+        """
+        if isinstance(record, Metrics) and record.role != 'sim':
+            return False
+        if isinstance(record, EpisodeResult) and record.purpose != 'training':
+            return False
+        return self._belongs(record)
 
     def _belongs(self, record: Record) -> bool:
         """Whether a record is of a committed phase, or of none."""
