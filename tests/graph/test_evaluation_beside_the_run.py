@@ -10,9 +10,23 @@ pytest.importorskip('rclpy', reason='needs ROS')
 from kills import phase_of
 
 from codetr_ros.cores import in_process
+from helpers import layout
 from helpers.builders import tiny
-from helpers.nodes import Nodes, Witness, domain
+from helpers.nodes import NAMESPACE, Nodes, Witness, domain
 from helpers.runs import finish, node_of, start, until, write
+
+
+def plotted(witness):
+    """Whether all that the layout for Foxglove plots is there, with a type that can be plotted."""
+    names = {NAMESPACE + name.removeprefix(layout.NAMESPACE) for name in layout.plotted()}
+    assert len(names) >= 6
+    seen = {}
+
+    def found():
+        seen.update(witness.link.node.get_topic_names_and_types())
+        return names <= set(seen) and all(seen[n] == ['std_msgs/msg/Float64'] for n in names)
+
+    return found
 
 
 @pytest.mark.slow
@@ -25,6 +39,7 @@ def test_an_evaluator_that_stands_still_delays_no_phase_and_makes_up_for_it(tmp_
         nodes.send(signal.SIGSTOP, 'evaluate')
         witness.until(lambda: witness.committed(last))  # under a policy that it should evaluate
         nodes.send(signal.SIGCONT, 'evaluate')
+        witness.until(plotted(witness))
         codes = nodes.wait()
     assert set(codes.values()) == {0}, codes
     said = nodes.report('evaluate')

@@ -1,8 +1,6 @@
 """Each number of a run on a topic of its own, as plotting tools subscribe to it: by name."""
 
-import json
 import time
-from pathlib import Path
 
 import pytest
 import rclpy
@@ -15,9 +13,9 @@ from codetr_ros.records import EpisodeResult, Metrics, metrics
 from codetr_ros.ros.link import Link
 from codetr_ros.ros.plots import OF_EPISODES, topic
 from helpers.builders import tiny
+from helpers.layout import layout, plotted
 from helpers.summaries import episode
 
-LAYOUT = Path(__file__).resolve().parents[2] / 'codetr_ros' / 'config' / 'foxglove.json'
 DEADLINE = 30.0  # [s]
 
 
@@ -68,19 +66,6 @@ def test_a_tool_that_knows_nothing_of_this_project_receives_the_numbers_by_name(
         assert f'/run_x/plot/learner/{name}' in types
 
 
-def paths() -> set[str]:
-    """Topics that the layout for Foxglove plots."""
-    layout = json.loads(LAYOUT.read_text())
-    found = set()
-    for identity, panel in layout['configById'].items():
-        assert identity.startswith('Plot!')
-        for path in panel['paths']:
-            name, _, field = path['value'].partition('.')
-            assert field == 'data'
-            found.add(name)
-    return found
-
-
 @pytest.mark.slow
 def test_what_the_layout_for_foxglove_plots_is_published_by_a_run():
     published = set()
@@ -93,16 +78,16 @@ def test_what_the_layout_for_foxglove_plots_is_published_by_a_run():
             published.update(f'/codetr/{topic(record.source, name)}' for name in OF_EPISODES)
 
     in_process.run(tiny(steps=600), 'r', None, observe)
-    assert len(paths()) >= 6
-    assert paths() <= published
+    assert len(plotted()) >= 6
+    assert plotted() <= published
 
 
 def test_every_panel_of_the_layout_is_placed():
-    layout = json.loads(LAYOUT.read_text())
+    shipped = layout()
 
     def placed(place) -> set[str]:
         if isinstance(place, str):
             return {place}
         return placed(place['first']) | placed(place['second'])
 
-    assert placed(layout['layout']) == set(layout['configById'])
+    assert placed(shipped['layout']) == set(shipped['configById'])
