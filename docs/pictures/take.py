@@ -1,10 +1,11 @@
-"""Take the pictures of what one sees: the terminal of the default run, its report, and its page.
+"""Take the pictures of what one sees: the terminal of the default run, its report, and its page,
+and a film strip of `codetr demo person`.
 
-    .venv/bin/python docs/pictures/take.py [--run-folder DIR]
+    .venv/bin/python docs/pictures/take.py [--run-folder DIR] [--only-people]
 
 The run is a real one, over topics, in a terminal of 92 columns. What it leaves on the screen
 becomes terminal.svg. A headless Chromium photographs the report, and the page of `codetr watch`:
-report.png and watch.png.
+report.png and watch.png. strip.py lets a person score on the page of the demo: people.png.
 """
 
 import argparse
@@ -20,6 +21,7 @@ import tempfile
 import termios
 from pathlib import Path
 
+import strip
 from rich.console import Console
 from rich.text import Text
 
@@ -125,8 +127,13 @@ def main() -> None:
     """Make the pictures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--run-folder', type=Path, default=Path('runs/pictures'))
-    folder = parser.parse_args().run_folder
+    parser.add_argument('--only-people', action='store_true', help='only the film strip')
+    given = parser.parse_args()
     codetr = str(Path(sys.executable).with_name('codetr'))
+    strip.take(HERE / 'people.png', codetr)
+    if given.only_people:
+        return
+    folder = given.run_folder
     output = recorded([codetr, 'train', '--out', str(folder)])
     (HERE / 'terminal.svg').write_text(drawn(screen(output), 'make train'))
     photographed(folder.resolve() / 'report.html', HERE / 'report.png', '1000,1460')
