@@ -10,6 +10,7 @@ from codetr_ros.simtest.network import Weather
 from codetr_ros.simtest.plan import Death, all_settings, plan
 from codetr_ros.simtest.process import Pace
 from codetr_ros.simtest.run import carry_out
+from helpers.leaving import TWO, leaving
 
 
 def deadly(number):
@@ -48,3 +49,17 @@ def test_killed_simulators_come_back_and_the_weights_are_the_same(number):
     ended = carry_out(deadly(number), kept=10_000)
     assert ended.failures == []
     assert ended.errors == {}
+
+
+@pytest.mark.parametrize(('seconds', 'left_out'), [(0.5, 0), (2.0, 0), (8.0, 1)])
+def test_a_killed_simulator_is_left_out_only_if_it_is_not_there_again_in_time(seconds, left_out):
+    planned = leaving(TWO, {}, slow='sim_2')
+    death = Death('sim_2', 2.6, seconds)
+    ended = carry_out(replace(planned, deaths=(death,)), kept=10_000)
+    assert ended.failures == []  # the weights are the undisturbed ones if nothing was dropped
+    assert ended.errors == {}
+    assert sum('sim_2       is killed' in line for line in ended.trace) == 1
+    assert sum('leaves sim_2 out' in line for line in ended.trace) == left_out
+    again = next(i for i, line in enumerate(ended.trace) if 'is started again' in line)
+    later = [line for line in ended.trace[again:] if ' sim_2 ' in line]
+    assert any('publishes Transitions' in line for line in later)
