@@ -122,6 +122,11 @@ def bad_scores(known: CompositeReward) -> list[Record]:
     ]
 
 
+def waits_for_permission(sim: Presence) -> bool:
+    """Whether the simulator has waited for so long that it has taken all that was on its way."""
+    return 'permission' in sim.doing and sim.waiting > 2
+
+
 @dataclass
 class Outcome:
     """What a run with an intruder left, and the digests of one without."""
@@ -146,7 +151,10 @@ def outcome(tmp_path_factory):
         witness.until(lambda: witness.committed(1) and witness.scores)
         # the simulator begins once it has found the evaluator, which may not have found it yet
         witness.until(lambda: 'everybody is there' in nodes.log('evaluate'))
-        nodes.send(signal.SIGSTOP, 'sim')  # it waits for the next policy: no step, no phase
+        nodes.send(signal.SIGSTOP, 'learner')
+        witness.until(lambda: waits_for_permission(witness.presence['sim']))
+        nodes.send(signal.SIGSTOP, 'sim')  # it has said all of its phase, and begins none
+        nodes.send(signal.SIGCONT, 'learner')
         witness.say(*bad_transitions())
         witness.say(*bad_scores(witness.scores[0]))
         witness.say(policy())  # the very policy of before

@@ -47,7 +47,8 @@ def test_a_run_ends_well_and_is_replayed_though_its_robot_node_and_its_recorder_
     assert sum(chunk.steps for chunk in chunks) == settings.steps
     assert [chunk.sequence for chunk in chunks] == list(range(len(chunks)))
     own = [r.sequence for r in records if isinstance(r, CompositeReward) and r.scorer == 'robot']
-    assert own == list(range(len(own))) and len(own) > 3
+    # each of them once; what the recorder missed while it was dead comes behind newer ones
+    assert sorted(own) == list(range(len(own))) and len(own) > 3
     labelled = [record.phase for record in records if isinstance(record, StepRewards)]
     assert labelled == sorted(labelled)
     assert set(labelled) == set(range(settings.first_labelled, settings.phases))
