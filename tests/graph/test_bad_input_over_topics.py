@@ -122,9 +122,9 @@ def bad_scores(known: CompositeReward) -> list[Record]:
     ]
 
 
-def waits_for_permission(sim: Presence) -> bool:
-    """Whether the simulator has waited for so long that it has taken all that was on its way."""
-    return 'permission' in sim.doing and sim.waiting > 2
+def waits_for_permission(node: Presence) -> bool:
+    """Whether a node has waited for so long that it has taken all that was on its way."""
+    return 'permission' in node.doing and node.waiting > 2
 
 
 @dataclass
@@ -152,7 +152,8 @@ def outcome(tmp_path_factory):
         # the simulator begins once it has found the evaluator, which may not have found it yet
         witness.until(lambda: 'everybody is there' in nodes.log('evaluate'))
         nodes.send(signal.SIGSTOP, 'learner')
-        witness.until(lambda: waits_for_permission(witness.presence['sim']))
+        for name in ('sim', 'record'):  # the phase is committed, and no lie can be of it
+            witness.until(lambda name=name: waits_for_permission(witness.presence[name]))
         nodes.send(signal.SIGSTOP, 'sim')  # it has said all of its phase, and begins none
         nodes.send(signal.SIGCONT, 'learner')
         witness.say(*bad_transitions())
