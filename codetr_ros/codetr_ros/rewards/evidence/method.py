@@ -40,7 +40,7 @@ from codetr_ros.rewards.evidence.sample import Sample, Sampler, chosen
 from codetr_ros.rewards.evidence.uncertainty import (
     Uncertainty,
     deviations,
-    level_covariance,
+    levels,
     step_deviations,
 )
 from codetr_ros.rewards.evidence.verdicts import are_verdicts, require_few_values
@@ -310,14 +310,12 @@ class Evidence(Predictor):
         self._require_prepared()
         model, m = self._model, batch.lengths - batch.context
         features = [self._features(piece) for piece in _steps(batch, segment_steps(batch))]
-        factor = model.scale / self.unit
-        found = level_covariance(model, features, m) * factor**2
+        found = levels(model, features, m)
+        revealed = found.covariance * (model.scale / self.unit) ** 2
         if model.verdicts is None:
-            return found
-        f = self._f(batch, model)
-        levels = model.link.forward(f, np.cumsum(m) - m, m)[0]
-        share = model.verdicts.revealed(levels, deviations(model, features, m).segments ** 2)
-        return found * np.sqrt(np.outer(share, share))
+            return revealed
+        share = model.verdicts.revealed(found.mean, found.variance)
+        return revealed * np.sqrt(np.outer(share, share))
 
     def step_deviations(self, batch: SegmentBatch) -> F32:
         """How far each label (B, L) may be off, one standard deviation."""

@@ -54,32 +54,35 @@ def deviations(model: Model, features: list[Tensor], m: I64) -> Deviations:
         features: (N, D) of the segments' steps, in pieces.
         m: (S,) the segments' steps.
     """
-    step_noise, score_noise = np.exp(model.theta[-2:])
-    rows, slopes = _level_rows(model, features, m)
-    spread = np.add.reduceat(slopes * slopes, np.cumsum(m) - m)
-    levels = model.posterior.variances(rows).numpy() + step_noise * spread + score_noise
-    return Deviations(step_deviations(model, features), np.sqrt(levels))
+    found = levels(model, features, m)
+    return Deviations(step_deviations(model, features), np.sqrt(found.variance))
 
 
-def level_covariance(model: Model, features: list[Tensor], m: I64) -> F64:
-    """Covariance (S, S) of segments' levels under the posterior of the weights alone.
+@dataclass(frozen=True, eq=False, slots=True)
+class Levels:
+    """What a regression expects of levels of segments' scores, in units of the level scale."""
+
+    mean: F64  # (S,)
+    variance: F64  # (S,) predicted from their steps alone
+    covariance: F64  # (S, S) under the posterior of the weights alone
+
+
+def levels(model: Model, features: list[Tensor], m: I64) -> Levels:
+    """Mean and variances of levels, F linearised at the present f.
 
     Args:
         model: a fitted regression.
         features: (N, D) of the segments' steps, in pieces.
         m: (S,) the segments' steps.
     """
-    rows, _ = _level_rows(model, features, m)
-    covariance: F64 = (rows @ model.posterior.covariance @ rows.T).numpy()
-    return covariance
-
-
-def _level_rows(model: Model, features: list[Tensor], m: I64) -> tuple[Tensor, F64]:
-    """What weights are multiplied by for a level (S, D), F linearised, and its slopes (N,)."""
-    f = np.concatenate([of_steps(piece, model.posterior.mean) for piece in features])
-    slopes = model.link.forward(f, np.cumsum(m) - m, m)[1]
+    starts, known = np.cumsum(m) - m, model.posterior
+    f = np.concatenate([of_steps(piece, known.mean) for piece in features])
+    mean, slopes = model.link.forward(f, starts, m)
     weights, parts = (
         torch.split(each, m.tolist()) for each in (torch.tensor(slopes), torch.cat(features))
     )
-    rows = [w @ part.double() for w, part in zip(weights, parts, strict=True)]
-    return torch.stack(rows), slopes
+    rows = torch.stack([w @ part.double() for w, part in zip(weights, parts, strict=True)])
+    step_noise, score_noise = np.exp(model.theta[-2:])
+    own = step_noise * np.add.reduceat(slopes * slopes, starts) + score_noise
+    covariance: F64 = (rows @ known.covariance @ rows.T).numpy()
+    return Levels(mean, known.variances(rows).numpy() + own, covariance)
