@@ -78,6 +78,8 @@ class Scorer:
 
     def run(self) -> int:
         """Score what is wanted until the run has ended; returns how many scores it took."""
+        self.call(self._wanted, most=1)
+        print(f'scores what {self._wanted.srv_name} names', flush=True)
         while True:
             wanted = self.call(self._wanted, most=1, steps=True)
             if wanted.finished:

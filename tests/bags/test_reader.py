@@ -182,7 +182,7 @@ def test_the_library_reads_bags_where_ros_is_absent(tmp_path):
     """
     done = subprocess.run(
         [sys.executable, '-c', textwrap.dedent(program), str(bag)],
-        capture_output=True, text=True, check=False, timeout=60,
+        capture_output=True, text=True, check=False, timeout=180,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) == len(a_run())

@@ -217,7 +217,7 @@ def test_a_full_disk_is_said(tmp_path):
     """
     done = subprocess.run(
         [sys.executable, '-c', textwrap.dedent(program), str(bag), str(tmp_path / 'new')],
-        capture_output=True, text=True, check=False, timeout=60,
+        capture_output=True, text=True, check=False, timeout=180,
     )  # fmt: skip
     assert 'cannot be written: File too large' in done.stdout, done.stderr
 

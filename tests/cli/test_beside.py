@@ -6,7 +6,7 @@ import time
 from codetr_ros.cli.beside import Beside
 from codetr_ros.runs import folder as run_folder
 
-PATIENCE = 30.0
+PATIENCE = 120.0
 
 
 def printed(folder, program):

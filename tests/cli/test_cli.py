@@ -379,7 +379,7 @@ def test_ctrl_c_ends_a_run_in_process_with_a_checkpoint_and_a_summary(tmp_path: 
             if line.startswith('after 200 steps'):
                 break
         child.send_signal(signal.SIGINT)
-        shown, _ = child.communicate(timeout=60)
+        shown, _ = child.communicate(timeout=180)
     finally:
         child.kill()
 

@@ -91,7 +91,7 @@ def test_doctor_goes_on_where_mujoco_cannot_be_imported_with_its_driver() -> Non
         capture_output=True,
         text=True,
         check=False,
-        timeout=60,
+        timeout=180,
     )
     assert done.returncode == 0, done.stderr
     assert "status='fail'" in done.stdout

@@ -19,7 +19,7 @@ def test_the_demo_serves_both_pages_and_ends_by_itself_with_who_taught(tmp_path)
         score = demo.until(r'score as you at (http\S+)')[1]
         watch = demo.until(r'watch \S+ at (http\S+)')[1]
         assert desk_of(score)['scorer'] == 'you'
-        with urllib.request.urlopen(watch, timeout=10) as page:
+        with urllib.request.urlopen(watch, timeout=60) as page:
             assert b'<h1' in page.read()
         code = demo.end()
     assert code == 0, demo.text

@@ -14,7 +14,7 @@ from rclpy.signals import SignalHandlerOptions
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.verify import verify
 from codetr_ros.records import CompositeReward
-from helpers.judging import CODETR, PATIENCE, Command, desk_of, judge, summary_of
+from helpers.judging import CODETR, PATIENCE, Command, desk_of, held, judge, summary_of
 from helpers.nodes import domain
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -24,6 +24,7 @@ FLAGS = (
     *('--scorer', 'topic', '--task', 'Reacher-v5', '--delay', '25', '--score-service'),
     *('--steps', '4000', '--warmup-steps', '1000', '--phase-steps', '500'),
     *('--method', 'evidence', '--evaluate-every', '0', '--no-film', '--sac.hidden', '32', '32'),
+    *('--peer-deadline', str(PATIENCE)),
 )
 
 
@@ -61,21 +62,24 @@ def test_a_program_scores_by_service_and_a_page_without_the_key_takes_nothing(tm
             Command((*CODETR, 'score', namespace, '--name', 'ben')) as page,
             Command((*program, '-r', f'__ns:={namespace}')) as scorer,
         ):
+            with held(train, out):
+                scorer.until('scores what')
+                page.until("nothing that 'ben' states is taken")
+                url = page.until(r'score as ben at (http\S+)')[1]
+                desk = desk_of(url)
+                assert 'has a key and this process has none' in desk['problem']
+                assert 'CODETR_RUN_KEY' in desk['problem']
+                with pytest.raises(urllib.error.HTTPError, match='422') as refused:
+                    judge(url, ['sim', 0, 0, 25], 3)
+                assert 'CODETR_RUN_KEY' in refused.value.read().decode()
             scorer.until('published as number 0')
             requests = calls()
             assert requests, 'no call of the service is documented'
-            for fields in requests:
-                answer = called(namespace, ScoreSegment.Request(**(fields | {'token': token})))
-                assert answer.accepted or 'segment' in answer.message, answer.message
-                assert not called(namespace, ScoreSegment.Request(**fields)).accepted
-            page.until("nothing that 'ben' states is taken")
-            url = page.until(r'score as ben at (http\S+)')[1]
-            desk = desk_of(url)
-            assert 'has a key and this process has none' in desk['problem']
-            assert 'CODETR_RUN_KEY' in desk['problem']
-            with pytest.raises(urllib.error.HTTPError, match='422') as refused:
-                judge(url, ['sim', 0, 0, 25], 3)
-            assert 'CODETR_RUN_KEY' in refused.value.read().decode()
+            with held(train, out):
+                for fields in requests:
+                    answer = called(namespace, ScoreSegment.Request(**(fields | {'token': token})))
+                    assert answer.accepted or 'segment' in answer.message, answer.message
+                    assert not called(namespace, ScoreSegment.Request(**fields)).accepted
             scored, left = scorer.end(), page.end()
         code = train.end()
     assert code == 0, train.text

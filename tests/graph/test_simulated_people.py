@@ -12,7 +12,7 @@ from codetr_ros.cli import main
 from codetr_ros.nodes.signing import VARIABLE, new_key
 from codetr_ros.records import Commit, CompositeReward, ScoreRequest
 from codetr_ros.runs import reports
-from helpers.judging import CODETR, PATIENCE, Command, desk_of, judge, summary_of
+from helpers.judging import CODETR, PATIENCE, Command, desk_of, held, judge, summary_of
 from helpers.nodes import domain
 
 FLAGS = (
@@ -21,6 +21,7 @@ FLAGS = (
     *('--task', 'Reacher-v5', '--delay', '25', '--method', 'evidence'),
     *('--steps', '4000', '--warmup-steps', '1000', '--phase-steps', '500'),
     *('--evaluate-every', '0', '--no-film', '--sac.hidden', '32', '32'),
+    *('--peer-deadline', str(PATIENCE)),
 )
 PEOPLE = ('person_a', 'person_b')
 
@@ -47,7 +48,9 @@ def a_run(tmp_path_factory):
         namespace = train.until(r'namespace: (\S+)')[1]
         # the page finds the domain of the test in the variables of this process
         with Command((*CODETR, 'score', namespace, '--name', 'ann'), environment) as page:
-            segment = corrected(page.until(r'score as ann at (http\S+)')[1])
+            with held(train, out):
+                url = page.until(r'score as ann at (http\S+)')[1]
+            segment = corrected(url)
             assert page.end() == 0, page.text
         assert train.end() == 0, train.text
     return out, segment

@@ -1,6 +1,6 @@
-"""The reward node, which no transitions, or no commits, reach: the network has lost them all."""
+"""The reward node, which no records of a kind reach: the network has lost them all."""
 
-from codetr_ros.records import Commit, Transitions
+from codetr_ros.records import Commit, TaskSpec, Transitions
 from codetr_ros.ros.node import run_node
 from codetr_ros.ros.wiring import Wiring
 from reward_node.reward import load
@@ -24,3 +24,13 @@ class Uncommitted(Wiring):
 
 def uncommitted() -> int:
     return run_node('reward', 'reward', load, wire=Uncommitted)
+
+
+class Unannounced(Wiring):
+    def take(self, kind, message):
+        if kind is not TaskSpec:
+            super().take(kind, message)
+
+
+def unannounced() -> int:
+    return run_node('reward', 'reward', load, wire=Unannounced)

@@ -3,12 +3,14 @@
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import threading
 import time
 import urllib.request
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -81,9 +83,43 @@ class Command:
         return code
 
 
+def children(pid: int) -> dict[int, str]:
+    """The processes that a process has started: the command line of each by its number."""
+    found = {}
+    for folder in Path('/proc').glob('[0-9]*'):
+        try:
+            parent = int((folder / 'stat').read_text().rsplit(')', 1)[1].split()[1])
+            if parent == pid:
+                found[int(folder.name)] = (folder / 'cmdline').read_text().replace('\0', ' ')
+        except (FileNotFoundError, ProcessLookupError):
+            continue  # it has ended meanwhile
+    return found
+
+
+@contextmanager
+def held(train: Command, out: Path, node: str = 'learner') -> Iterator[None]:
+    """Hold a node of a run that has begun, so that the run cannot end meanwhile.
+
+    Args:
+        train: the command that has started the nodes.
+        out: the folder of the run.
+        node: the name of the node, and of its program.
+    """
+    log, end = out / 'logs' / f'{node}.log', time.monotonic() + PATIENCE
+    while not (log.exists() and 'everybody is there' in log.read_text()):
+        assert time.monotonic() < end and train.process.poll() is None, train.text
+        time.sleep(0.01)
+    (pid,) = (pid for pid, words in children(train.process.pid).items() if f'/{node} ' in words)
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(pid, signal.SIGCONT)
+
+
 def desk_of(url: str) -> dict[str, Any]:
     """What the page of a scorer shows now."""
-    with urllib.request.urlopen(url + 'events', timeout=10) as stream:
+    with urllib.request.urlopen(url + 'events', timeout=60) as stream:
         for line in stream:
             if line.startswith(b'data: {"scorer"'):
                 return json.loads(line[6:])  # type: ignore[no-any-return]
@@ -94,7 +130,7 @@ def judge(url: str, segment: Sequence[Any], value: float) -> dict[str, Any]:
     """Score a segment on the page of a scorer."""
     sent = json.dumps({'segment': segment, 'value': value}).encode()
     request = urllib.request.Request(url + 'judge', sent, {'Content-Type': 'application/json'})
-    with urllib.request.urlopen(request, timeout=10) as answer:
+    with urllib.request.urlopen(request, timeout=60) as answer:
         return json.loads(answer.read())  # type: ignore[no-any-return]
 
 

@@ -30,6 +30,7 @@ from codetr_ros.runs import folder as run_folder
 from helpers import forked
 
 PATIENCE = 120.0  # [s] a busy machine starts five nodes in 40
+PEER_DEADLINE = 2 * PATIENCE  # [s] a node that a test holds is not given up before the test gives up
 RUN_ID = 'run'
 NAMESPACE = f'/run_{RUN_ID}'
 
@@ -69,7 +70,8 @@ class Nodes:
         self.key = key
         self.folder = run_folder.create(folder)
         run_folder.write_settings(folder, settings)
-        self._commands = {c.name: c for c in launcher.commands(settings, RUN_ID, folder)}
+        made = launcher.commands(settings, RUN_ID, folder, peer_deadline=PEER_DEADLINE)
+        self._commands = {command.name: command for command in made}
         self._environment = launcher.environment(settings) | ({VARIABLE: key} if key else {})
         self._processes = launcher.Processes(print, start_program=start)
         self.names = tuple(self._commands)

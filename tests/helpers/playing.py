@@ -21,11 +21,12 @@ MODULES = {
     'score': 'codetr_ros.ros.score',
     'deaf': 'helpers.deaf',
     'uncommitted': 'helpers.deaf:uncommitted',
+    'unannounced': 'helpers.deaf:unannounced',
     'imports': 'helpers.slow_import',
     'compiles': 'helpers.slow_import:compiling',
 }
 NAMESPACE = '/r'
-PATIENCE = 60.0  # discovery and imports on a busy machine
+PATIENCE = 180.0  # discovery and imports on a busy machine
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from codetr_ros.processes.launcher import Command, Processes
 
-PATIENCE = 20.0  # seconds after which a test gives up; nothing waits for it to pass
+PATIENCE = 120.0  # seconds after which a test gives up; nothing waits for it to pass
 
 
 READY = 'import signal, sys, time\n'

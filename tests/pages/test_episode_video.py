@@ -131,4 +131,4 @@ def test_the_page_names_why_an_episode_is_not_drawn(
     ):
         page = tab(server.url)
         videos.look(recorded)
-        page.wait_for_selector('#no-video:has-text("is not drawn: disable: ")', timeout=30_000)
+        page.wait_for_selector('#no-video:has-text("is not drawn: disable: ")', timeout=120_000)

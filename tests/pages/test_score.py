@@ -257,7 +257,7 @@ def test_pictures_that_nobody_waits_for_any_more_are_not_drawn():
     slow = Slow()
 
     def wait_for(port, first):
-        connection = HTTPConnection('127.0.0.1', port, timeout=10)
+        connection = HTTPConnection('127.0.0.1', port, timeout=60)
         sent = json.dumps(asked_for_pictures(first))
         connection.request('POST', '/segment', sent, {'Content-Type': 'application/json'})
         return connection

@@ -174,7 +174,7 @@ def test_a_second_set_up_waits_for_the_first_and_says_so(root: Path):
             text=True,
         )
         assert 'waiting for it' in process.stdout.readline()
-    assert process.communicate(timeout=30)[0] == 'in\n'
+    assert process.communicate(timeout=120)[0] == 'in\n'
 
 
 def test_make_names_an_interpreter_that_does_not_exist():

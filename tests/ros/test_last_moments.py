@@ -22,7 +22,7 @@ def test_a_node_that_hangs_at_its_very_end_says_where_and_ends_with_its_own_exit
         [sys.executable, '-c', HANGS, str(code)],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=180,
         check=False,
     )
 

@@ -109,6 +109,32 @@ def test_a_commit_that_was_lost_is_asked_for_though_none_follows(play, tmp_path)
 
 
 @pytest.mark.slow
+def test_what_a_source_has_announced_is_asked_for_if_it_was_lost(play, tmp_path):
+    play = play(settings=settings(), roles=('learner', 'sim'))
+    outbox = Outbox(phase_steps=5, phases=1)
+    serve_outbox(play.links['sim'], 'run', outbox)
+    outbox.keep(task_spec())
+    for record in (transitions(phase=1, sequence=1), transitions(phase=2, sequence=2)):
+        outbox.keep(record)  # of later phases: what was announced is not among the newest
+    with (
+        process('record') as record,
+        process('unannounced', f'folder:={tmp_path}', 'peer_deadline:=30.0') as node,
+    ):
+        play.until(lambda: read_by(play, 'record', 'reward') and waits_for_a_phase(play), node)
+        publish_a_phase(play)
+        play.until(lambda: play.messages('StepRewards', 'learner'), node)
+        play.until(lambda: [p for p in play.presence_of('reward') if p.finished])
+        play.finished = True
+        play.until(lambda: node.poll() is not None and record.poll() is not None)
+        said = output(node)
+    assert node.returncode == 0, said
+    assert 'what a source has announced had not arrived: it came again' in said
+    report = json.loads(run_folder.report_path(tmp_path, 'reward', 'reward').read_text())
+    assert report['lost'] == report['duplicated'] == {}
+    assert report['fetched'] == {'task': 1}
+
+
+@pytest.mark.slow
 def test_what_was_lost_of_an_early_phase_is_asked_for_though_later_ones_are_whole(play, tmp_path):
     """A network that was cut: what no commit names, such as true rewards, is noticed late."""
     phases = 6

@@ -45,11 +45,11 @@ def player(bag: Path, *flags: str):
 
 
 def test_who_is_missing_is_named_with_what_starts_it(ros_domain, tmp_path):
-    with player(ours(tmp_path / 'bag', uniform()), '--deadline', '1') as node:
+    with player(ours(tmp_path / 'bag', uniform()), '--deadline', '5') as node:
         said = output(node)
     assert node.returncode == 1
     assert (
-        f'gave up after 1 s: it waits for reward (start it with `{command("reward")}` in this '
+        f'gave up after 5 s: it waits for reward (start it with `{command("reward")}` in this '
         'namespace). A larger --deadline makes it wait longer' in said
     )
     assert 'Traceback' not in said

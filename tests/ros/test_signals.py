@@ -34,7 +34,7 @@ def test_a_node_that_imports_what_makes_it_a_node_ends_at_once(tmp_path, number)
         assert node.stdout is not None
         assert node.stdout.readline() == 'imports\n'
         node.send_signal(number)
-        _, said = node.communicate(timeout=60)
+        _, said = node.communicate(timeout=180)
     finally:
         node.kill()
     assert (node.returncode, said) == (0, f'stopped by {number.name} before it had started\n')

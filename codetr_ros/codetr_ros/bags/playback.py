@@ -190,6 +190,7 @@ class Playback:
     """
 
     missing = unlabelled = uncommitted = None  # it takes no phases in
+    unannounced = False
     due = None
 
     def __init__(

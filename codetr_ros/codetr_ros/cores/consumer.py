@@ -84,6 +84,11 @@ class Consumer(Part, ABC):
         more = commits.next < self._settings.phases and not commits.of(commits.next)
         return commits.next if more and self.missing is None else None
 
+    @property
+    def unannounced(self) -> bool:
+        """Whether what one of the sources simulates is not known yet."""
+        return not self._intake.tasks.known
+
     def catch_up(self, newest: int) -> None:
         """Note that phases up to `newest` are committed, whether their commits have come or not:
         those that have not been taken in are then missing.

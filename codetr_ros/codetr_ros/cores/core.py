@@ -33,6 +33,10 @@ class Core(Protocol[Given_co]):
         """The phase whose commit comes next; None if none is awaited here."""
 
     @property
+    def unannounced(self) -> bool:
+        """Whether it has to know what all sources simulate, and does not yet."""
+
+    @property
     def due(self) -> int | None:
         """The next phase to be finished here; None if there are none here."""
 
@@ -91,6 +95,11 @@ class Part:
     def uncommitted(self) -> int | None:
         """The phase whose commit comes next; None if none is awaited here."""
         return None
+
+    @property
+    def unannounced(self) -> bool:
+        """Whether it has to know what all sources simulate, and does not yet."""
+        return False
 
     @property
     def due(self) -> int | None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Iterator
 
-from codetr_ros.records import Presence, Record, RunSpec
+from codetr_ros.records import Presence, Record, RunSpec, TaskSpec
 from codetr_ros.records.fields import type_name
 from codetr_ros.records.identity import identity, phase_of
 
@@ -16,7 +16,7 @@ class Outbox:
     Nobody publishes for a phase that was not permitted, and the learner permits one only when
     those that lie `lag` behind are committed. So a few phases more than `lag` cover all that any
     reader can lack, however long nothing has reached it. What the evaluator publishes, which
-    nobody waits for, is small, and all of it is kept.
+    nobody waits for, is small, and all of it is kept. So is what a source announces.
 
     Args:
         phase_steps: environment steps of a phase.
@@ -27,6 +27,7 @@ class Outbox:
         self._phase_steps = phase_steps
         self._most = phases
         self._phases: dict[int, dict[object, Record]] = {}
+        self._announced: dict[object, TaskSpec] = {}
         self._phase = 0  # of the last record that named one
 
     @property
@@ -42,12 +43,15 @@ class Outbox:
         if phase is not None:
             self._phase = phase
         key = type(record), identity(record)
+        if isinstance(record, TaskSpec):
+            self._announced[key] = record
         self._phases.setdefault(self._phase, {})[key] = record
         while self._most is not None and len(self._phases) > self._most:
             del self._phases[min(self._phases)]
 
     def read(self, phase: int, kinds: Collection[str] = ()) -> Iterator[Record]:
-        """The records of a phase, in the order in which they were published.
+        """The records of a phase, in the order in which they were published, and before them, where
+        those are named, the announcements of all time.
 
         Args:
             phase: the phase.
@@ -59,8 +63,9 @@ class Outbox:
         if phase not in self._phases:
             held = ', '.join(map(str, sorted(self._phases))) or 'none yet'
             raise KeyError(f'nothing of phase {phase} is kept; of these is: {held}')
+        of_all_time = self._announced if kinds else {}
         return (
             record
-            for record in self._phases[phase].values()
+            for record in (of_all_time | self._phases[phase]).values()
             if not kinds or type_name(type(record)) in kinds
         )

@@ -1,5 +1,5 @@
 """Fetches what a learner or reward node lacks: committed phases from the recorder, labels from the
-reward node.
+reward node, what a source simulates from its simulator.
 """
 
 import time
@@ -9,9 +9,18 @@ from typing import Any
 from codetr_ros.cores.core import Core
 from codetr_ros.nodes.fetching import Fetching, Offered
 from codetr_ros.nodes.peers import Peers
-from codetr_ros.records import Commit, CompositeReward, Preference, StepRewards, Transitions
+from codetr_ros.records import (
+    TOPICS,
+    Commit,
+    CompositeReward,
+    Preference,
+    StepRewards,
+    TaskSpec,
+    Transitions,
+)
 from codetr_ros.records.fields import type_name
-from codetr_ros.ros.fetch import SERVICE, Answer, Asker, service_of
+from codetr_ros.records.roles import WRITERS
+from codetr_ros.ros.fetch import NEWEST, SERVICE, Answer, Asker, service_of
 from codetr_ros.ros.link import Link
 
 OF_PHASES = (Transitions, CompositeReward, Preference, Commit)
@@ -44,8 +53,9 @@ class Fetcher:
         self._peers = peers
         self._take = take
         self._recorder = Asker(link, SERVICE, run_id)
-        self._reward: tuple[str, Asker] | None = None
+        self._askers: dict[str, Asker] = {}  # of other nodes, by the names of their services
         self._phases, self._labels, self._commits = Fetching(), Fetching(), Fetching()
+        self._tasks = Fetching()
         self._offered, self._committed = Offered(), Offered()
         self._kinds: tuple[type, ...] = ()  # that the core takes in
         self._fetched: Callable[[int], None]  # lets the core know that a phase was sent again
@@ -63,6 +73,8 @@ class Fetcher:
         if self._commits.due(uncommitted, now):
             assert uncommitted is not None
             self._ask_commit(uncommitted)
+        if self._tasks.due(0 if core.unannounced else None, now):
+            self._ask_sources()
         behind = unlabelled is not None and unlabelled <= self.behind
         if self._labels.due(unlabelled, now, behind):
             assert unlabelled is not None
@@ -86,7 +98,7 @@ class Fetcher:
             self._recorder.ask(phase, lambda answer: self._offered_commit(phase, answer), kinds)
 
     def _offered_commit(self, phase: int, answer: Answer) -> None:
-        if answer.reason:
+        if answer.reason or not answer.messages:
             return  # it has not committed the phase yet
         if self._committed.lost(phase, time.monotonic()):
             self._log.warning(f'the commit of phase {phase} was lost: it came again')
@@ -94,18 +106,30 @@ class Fetcher:
                 self._take(kind, data, lost=True)
 
     def _ask_reward(self, phase: int) -> None:
-        asker = self._reward_node()
-        if asker is not None and asker.ready:
+        for asker in self._nodes('reward')[:1]:
             kinds = [type_name(StepRewards)]
             asker.ask(phase, lambda answer: self._labelled(phase, answer), kinds)
 
-    def _reward_node(self) -> Asker | None:
-        for peer in self._peers.alive('reward'):
-            node = peer.presence.node
-            if self._reward is None or self._reward[0] != node:
-                self._reward = node, Asker(self._link, service_of(node), self._run_id)
-            return self._reward[1]
-        return None
+    def _ask_sources(self) -> None:
+        """Ask all sources for what they have announced."""
+        for role in WRITERS[TOPICS[TaskSpec]]:
+            for asker in self._nodes(role):
+                asker.ask(NEWEST, self._announced, [type_name(TaskSpec)])
+
+    def _announced(self, answer: Answer) -> None:
+        for kind, data in answer.messages:
+            self._log.warning('what a source has announced had not arrived: it came again')
+            self._take(kind, data)
+
+    def _nodes(self, role: str) -> list[Asker]:
+        """Those that ask the nodes of a role which are there and answer."""
+        askers = []
+        for peer in self._peers.alive(role):
+            service = service_of(peer.presence.node)
+            if service not in self._askers:
+                self._askers[service] = Asker(self._link, service, self._run_id)
+            askers.append(self._askers[service])
+        return [asker for asker in askers if asker.ready]
 
     def _arrived(self, who: str, phase: int, answer: Answer) -> None:
         if answer.reason:

@@ -258,9 +258,9 @@ class Link:
 
     def close(self) -> None:
         """Take the node off the graph."""
-        self._executor.remove_node(self.node)
-        self.node.destroy_node()
+        # the executor holds what it waited for last; let go of after the node, it may crash
         self._executor.shutdown()
+        self.node.destroy_node()
 
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
