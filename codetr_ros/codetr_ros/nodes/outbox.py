@@ -50,8 +50,8 @@ class Outbox:
             del self._phases[min(self._phases)]
 
     def read(self, phase: int, kinds: Collection[str] = ()) -> Iterator[Record]:
-        """The records of a phase, in the order in which they were published, and before them, where
-        those are named, the announcements of all time.
+        """The records of a phase, in the order in which they were published. Announcements, where
+        they are named, come before them, whenever they were published.
 
         Args:
             phase: the phase.
