@@ -7,7 +7,7 @@ from codetr_ros.config.cuts import Cuts
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import CompositeReward, Preference
 from codetr_ros.rewards import registry
-from codetr_ros.runs.reports import PREFERENCES_UNUSED, VERDICTS_AS_NUMBERS
+from codetr_ros.runs.reports import PREFERENCES_UNUSED
 from helpers import builders
 from helpers.builders import ACTION, OBSERVATION, tiny
 
@@ -152,13 +152,12 @@ def test_methods_that_cannot_use_preferences_state_so():
         ({'evidence__link': 'choose'}, 30, {PREFERENCES_UNUSED: 20}),
         ({'composite': 'max'}, 30, {PREFERENCES_UNUSED: 20}),
         ({'composite': 'peak_end'}, 30, {PREFERENCES_UNUSED: 20}),
-        ({'evidence__score_scale': 'ordinal'}, 30, {VERDICTS_AS_NUMBERS: 30}),
-        ({'evidence__score_scale': 'ordinal'}, 0, {}),
+        ({'evidence__score_scale': 'ordinal'}, 30, {}),
         ({'method': 'uniform'}, 30, {PREFERENCES_UNUSED: 20}),
         ({'method': 'codetr', 'codetr__base': 'evidence', 'composite': 'max'}, 30,
          {PREFERENCES_UNUSED: 20}),
     ],
-    ids=range(8),
+    ids=range(7),
 )  # fmt: skip
 def test_judgements_that_are_not_learnt_from_as_they_were_stated_are_counted(
     changes, scores, aside
@@ -203,3 +202,21 @@ def test_scores_of_a_person_are_verdicts_where_few_of_them_differ(stars):
     assert ('thresholds' in made.report()) == stars
     labels = np.concatenate(list(made.label_passes(memory, memory.segments.all_ids())))
     assert np.corrcoef(labels, rewards)[0, 1] > 0.9
+
+
+@pytest.mark.parametrize('pairs', [20, 60])
+def test_verdicts_beside_preferences_are_taken_for_their_order_alone(pairs):
+    memory, rewards, worth = planted(pairs)
+    edges = np.quantile(worth, [0.1, 0.3, 0.4, 0.5])
+    stars = np.array([1.0, 2.0, 3.0, 4.0, 50.0])[np.digitize(worth, edges)]
+    for n, value in enumerate(stars[:40].tolist()):
+        memory.judge(builders.score(scorer='me', first_step=DELAY * n, length=DELAY, value=value))
+    memory.settle()
+    changes = {'method': 'evidence', 'composite': 'sum', 'evidence__link': 'known'}
+    made = trained(memory, **changes)
+    numbers = trained(memory, **changes, evidence__score_scale='numbers')
+    assert len(made.report()['thresholds']) == 4
+    order, both = (correlations(each, memory, rewards, worth)[0] for each in (made, numbers))
+    assert order > 0.99 > both
+    state, again = made.state(), trained(memory, **changes).state()
+    assert all((state[name] == again[name]).all() for name in state)

@@ -18,9 +18,7 @@ from codetr_ros.runs.facts import Counts, Facts
 from codetr_ros.system.files import atomic_write, make_folder
 
 PREFERENCES_UNUSED = 'preferences not used, method cannot'
-VERDICTS_AS_NUMBERS = 'verdicts taken for numbers, beside preferences'
-SET_ASIDE = (PREFERENCES_UNUSED, VERDICTS_AS_NUMBERS)
-"""Counts of judgements that are not learnt from as they were stated."""
+"""A count of judgements that are not learnt from."""
 
 
 class MemoryFacts(Facts):

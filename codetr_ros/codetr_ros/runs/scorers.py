@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 
 from codetr_ros.runs.document import Block, Heading, Paragraph, Table
 from codetr_ros.runs.numbers import number
-from codetr_ros.runs.reports import SET_ASIDE
+from codetr_ros.runs.reports import PREFERENCES_UNUSED
 from codetr_ros.runs.run_summary import RunSummary, ScorerRow
 
 _NAME = re.compile('scorer_(.+)_(scores|preferences|offset|slope|noise|agreement)')
@@ -38,10 +38,9 @@ def blocks(summary: RunSummary) -> Iterator[Block]:
         'scale of the first scorer. Agreement is the correlation with the mean of the others on '
         'shared segments. Counts are of what the memory held at the end.'
     )
-    for reason in SET_ASIDE:
-        count = sum(counts.get(reason, 0) for counts in summary.counters.values())
-        if count:
-            yield Paragraph(f'{count} {reason}: method {summary.settings["method"]}.')
+    unused = sum(counts.get(PREFERENCES_UNUSED, 0) for counts in summary.counters.values())
+    if unused:
+        yield Paragraph(f'{unused} {PREFERENCES_UNUSED}: method {summary.settings["method"]}.')
     head = ['scorer', 'scores', 'preferences', 'offset', 'slope', 'noise', 'agreement']
 
     def shown(value: float | None) -> str:

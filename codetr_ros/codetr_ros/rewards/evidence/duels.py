@@ -49,6 +49,15 @@ class Duels:
         rows = means[torch.tensor(first)] - means[torch.tensor(second)]
         return cls(rows, torch.tensor(1 / sample.m[first] + 1 / sample.m[second]), outcomes)
 
+    def before(self, deviation: float) -> tuple[F64, F64]:
+        """Mean and variance (P,) of the differences while nothing is known of the segments.
+
+        Args:
+            deviation: of levels.
+        """
+        count = len(self.outcomes)
+        return np.zeros(count), np.full(count, 2 * deviation**2)
+
     def sites(self, mean: F64, variance: F64, deviation: float) -> tuple[F64, F64]:
         """The differences (P,) and their variances (P,) that stand for the preferences.
 

@@ -44,7 +44,6 @@ from codetr_ros.rewards.evidence.uncertainty import (
     step_deviations,
 )
 from codetr_ros.rewards.evidence.verdicts import are_verdicts, require_few_values
-from codetr_ros.runs.reports import VERDICTS_AS_NUMBERS
 from codetr_ros.seeding import generator
 from codetr_ros.system.states import check_state
 
@@ -116,17 +115,13 @@ class Evidence(Predictor):
         seen = memory.segments.digest() ^ (0 if pairs is None else pairs.digest())
         if self._fits and seen == self._seen:
             return
+        ordinal = self._are_verdicts(memory, scores)
         if pairs is not None:
-            self._fit_pairs(memory, pairs)
+            self._fit_pairs(memory, pairs, ordinal)
             self._seen = seen
             return
         anew = len(all_ids) >= 2 * self._begun_at
         choosing = anew and self._own.link == 'choose'
-        ordinal = self._ordinal
-        if ordinal and memory.judgements is not None:
-            ordinal = are_verdicts(scores, self._own.score_scale == 'ordinal')
-        elif ordinal:
-            require_few_values(scores)
         steps = choosing or not all(model.link.linear for _, model in self._mixture)
         ids = self._ids(memory, all_ids, steps)
         moments = self._sampler.moments(memory, ids)
@@ -162,14 +157,18 @@ class Evidence(Predictor):
         """Whether the kind of score is known and linear in step rewards."""
         return self._own.link != 'choose' and self._model.link.linear
 
-    def set_aside(self, memory: Trajectories) -> dict[str, int]:
-        """Preferences where F is not linear or not known; verdicts beside those that are used."""
-        aside = super().set_aside(memory)
-        scores = memory.segments.scores(memory.segments.ids())
-        verdicts = self._ordinal and are_verdicts(scores, self._own.score_scale == 'ordinal')
-        if verdicts and self._pairs(memory) is not None:
-            aside[VERDICTS_AS_NUMBERS] = len(scores)
-        return aside
+    def _are_verdicts(self, memory: Trajectories, scores: F64) -> bool:
+        """Whether only the order of scores (S,) means anything.
+
+        Raises:
+            RewardModelError: the settings say so of the simulator's, which have many values.
+        """
+        if not self._ordinal:
+            return False
+        if memory.judgements is not None:
+            return are_verdicts(scores, self._own.score_scale == 'ordinal')
+        require_few_values(scores)
+        return True
 
     def _pairs(self, memory: Trajectories) -> Pairs | None:
         """The preferences to learn from; None where there are none, or none can be used."""
@@ -177,13 +176,13 @@ class Evidence(Predictor):
             return None
         return memory.judgements.pairs() or None
 
-    def _fit_pairs(self, memory: Trajectories, pairs: Pairs) -> None:
+    def _fit_pairs(self, memory: Trajectories, pairs: Pairs, ordinal: bool) -> None:
         scores = len(memory.segments.ids())
         if scores and self._model.scale == 1.0:  # that of preferences alone, which have no unit
             self._model = self._new_model()
         how = (self._features, self._sampler, memory, pairs, self._settings, self._fits)
         try:
-            seen = fit_pairs(self._model, *how)
+            seen = fit_pairs(self._model, *how, ordinal)
         except FloatingPointError as error:
             raise RewardModelError(
                 f'method {self.name!r}: the regression on {scores} scores and {len(pairs)} '

@@ -52,8 +52,6 @@ LEAST_LEFT = (1e-3, 0.2)
 for others. A few rounds of Gauss-Newton do not end where that would be exact, and without this and
 the next two bounds such fits diverge.
 """
-MOST_CHANGE = 4.0
-"""Of the unit of levels in a turn, as a factor: verdicts that show nothing have no spread."""
 FARTHEST, SUREST = 4.0, 0.05
 """Deviations of levels: how far from their mean a verdict's level may be, and the least deviation
 that it may have.
@@ -133,7 +131,7 @@ class Model:
         self.measure(sample.scores, sample.m)
         levels = self.link.level(sample.scores, sample.m) / self.scale
         if duels is not None:
-            self._fit_duels(sample, levels, some, duels)
+            self._fit_duels(sample, levels, some, duels, ordinal)
             return
         if ordinal:
             self._fit_verdicts(sample, levels, some)
@@ -143,61 +141,72 @@ class Model:
         slopes = self.link.log_slope(sample.scores, sample.m)[some]
         self.evidence += float(slopes.sum()) - len(some) * math.log(self.scale)
 
-    def _fit_duels(self, sample: Sample, levels: F64, some: I64, duels: Duels) -> None:
+    def _fit_duels(
+        self, sample: Sample, levels: F64, some: I64, duels: Duels, ordinal: bool
+    ) -> None:
         """Fit to scores and to what preferences state of differences: in turns.
 
-        Where there are scores, verdicts among them, these are taken for numbers.
+        Where the scores are verdicts, their scale is learnt in the same turns.
         """
-        count = len(levels)
+        count, scores = len(levels), sample.scores
         deviation = float(levels.std()) if count > 1 and levels.std() > 0 else 1.0
-        mean = np.zeros(len(duels.outcomes))
-        variance = np.full(len(mean), 2 * deviation**2)
-        places = torch.tensor(np.concatenate([some, count + np.arange(len(mean))]))
-        for _ in range(comparisons.TURNS):
-            differences, left = duels.sites(mean, variance, deviation)
+        places = torch.tensor(np.concatenate([some, count + np.arange(len(duels.outcomes))]))
+        verdicts, turns, mean, variance = None, comparisons.TURNS, np.zeros(0), np.zeros(0)
+        if ordinal:
+            verdicts, more, mean, variance = self._begin_verdicts(sample, levels)
+            turns = max(turns, more)
+        apart, apart_variance = duels.before(deviation)
+        for turn in range(turns):
+            targets = Targets(levels, torch.zeros(count, dtype=torch.float64))
+            if verdicts is not None:
+                targets = _sites(verdicts, scores, mean, variance)
+            differences, left = duels.sites(apart, apart_variance, deviation)
             data = Linear(
                 torch.cat([sample.means(), duels.rows]) if count else duels.rows,
                 torch.cat([torch.tensor(1 / sample.m), duels.spread]),
-                torch.tensor(np.concatenate([levels, differences])),
-                noise=torch.tensor(np.concatenate([np.zeros(count), left])),
+                torch.tensor(np.concatenate([targets.levels, differences])),
+                noise=torch.cat([torch.as_tensor(targets.noise), torch.tensor(left)]),
             )
             self.evidence, residuals = self._learn_scales(data.part(places), ITERATIONS)
             self.posterior = posterior(data, self.theta, self.blocks)
             self.fitted = True
-            mean, variance = from_others(data, self.theta, self.posterior, LEAST_LEFT[0])
-            mean, variance = mean[count:], variance[count:]
-        about = levels[some] - levels[some].mean() if count else np.zeros(0)
+            means, variances = from_others(data, self.theta, self.posterior, LEAST_LEFT[0])
+            mean, variance = means[:count], variances[:count]
+            apart, apart_variance = means[count:], variances[count:]
+            if verdicts is not None and turn < turns - 1:
+                verdicts, factor, shift = verdicts.followed(scores, levels, mean, variance)
+                mean, variance = mean * factor + shift, variance * factor**2
+                apart, apart_variance = apart * factor, apart_variance * factor**2
+        about = targets.levels[some] - targets.levels[some].mean() if count else np.zeros(0)
         total, off = float(about @ about), residuals[: len(some)]
         self.left_out_r2 = 1 - float(off @ off) / total if total > 0 else 0.0
-        self.verdicts = None
+        self.verdicts = verdicts
 
-    def _fit_verdicts(self, sample: Sample, levels: F64, some: I64) -> None:
-        """Fit to what verdicts state of levels, and learn their scale: in turns.
+    def _begin_verdicts(self, sample: Sample, levels: F64) -> tuple[Verdicts, int, F64, F64]:
+        """Where the turns of learning a scale of verdicts begin, and how many there are.
 
-        The levels keep the mean and the deviation that they have with verdicts taken for numbers:
-        else any other unit would do as well.
+        Returns:
+            The scale, the turns, and mean and variance (S,) of the levels before their verdicts.
         """
-        scores = sample.scores
-        known = self.verdicts
+        scores, known = sample.scores, self.verdicts
         if known is None or not np.array_equal(known.values, np.unique(scores)):
             verdicts, turns = Verdicts.first(scores, levels), TURNS[0]
             mean = np.full(len(scores), levels.mean())
         else:
             verdicts, turns = known, TURNS[1]
             mean = self._predicted(sample)
-        variance = np.full(len(scores), verdicts.spread)
+        return verdicts, turns, mean, np.full(len(scores), verdicts.spread)
+
+    def _fit_verdicts(self, sample: Sample, levels: F64, some: I64) -> None:
+        """Fit to what verdicts state of levels, and learn their scale: in turns."""
+        scores = sample.scores
+        verdicts, turns, mean, variance = self._begin_verdicts(sample, levels)
         for turn in range(turns):
             targets = _sites(verdicts, scores, mean, variance)
             self._fit(sample, targets, some)
             mean, variance = self._left_out(sample, targets)
             if turn < turns - 1:
-                verdicts = verdicts.learnt(scores, mean, variance)
-                expected = verdicts.expected(scores, mean, variance)[0]
-                several = len(verdicts.values) > 1
-                factor = float(levels.std() / (expected.std() or 1.0)) if several else 1.0
-                factor = min(max(factor, 1 / MOST_CHANGE), MOST_CHANGE)
-                shift = float(levels.mean() - factor * expected.mean())
-                verdicts = verdicts.moved(factor, shift)
+                verdicts, factor, shift = verdicts.followed(scores, levels, mean, variance)
                 mean, variance = mean * factor + shift, variance * factor**2
         self.verdicts = verdicts
         self.evidence = verdicts.log_likelihood(scores, mean, variance)

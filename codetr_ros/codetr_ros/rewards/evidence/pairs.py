@@ -21,6 +21,7 @@ def fit_pairs(
     pairs: Pairs,
     settings: Settings,
     fits: int,
+    ordinal: bool,
 ) -> I64:
     """Fit a model to scores, if there are any, and preferences.
 
@@ -32,6 +33,7 @@ def fit_pairs(
         pairs: the preferences.
         settings: the run's settings.
         fits: so many there were before.
+        ordinal: only the order of scores means anything.
 
     Returns:
         The ids of the segments that were looked at.
@@ -55,5 +57,5 @@ def fit_pairs(
     rng = generator(settings.seed, 'evidence', 'scales', fits)
     some = np.sort(rng.permutation(len(ids))[: settings.evidence.scale_scores])
     model.measure(memory.segments.scores(all_ids), memory.segments.lengths(all_ids))
-    model.fit(everything.part(at[0]), some, duels=duels)
+    model.fit(everything.part(at[0]), some, ordinal, duels)
     return seen

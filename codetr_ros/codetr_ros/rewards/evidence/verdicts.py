@@ -30,6 +30,8 @@ MOST_VALUES = 32
 """Of an ordinal scale."""
 FEW_VALUES = 10
 """Different scores up to which they are taken for verdicts where nobody says what they are."""
+MOST_CHANGE = 4.0
+"""Of the unit of levels in a turn, as a factor: verdicts that show nothing have no spread."""
 FAR = 30.0
 """Deviations from the mean at which a normal distribution ends."""
 
@@ -157,6 +159,31 @@ class Verdicts:
         best = minimize(loss, begin, method='L-BFGS-B', options={'maxiter': 30})
         thresholds, tau = scale(np.asarray(best.x, np.float64))
         return Verdicts(self.values, thresholds, tau, float(variance.mean()))
+
+    def followed(
+        self, scores: F64, levels: F64, mean: F64, variance: F64
+    ) -> tuple['Verdicts', float, float]:
+        """The scale under which verdicts are likeliest, in the unit that they have as numbers.
+
+        Levels keep the mean and the deviation that they have with verdicts taken for numbers: else
+        any other unit would do as well.
+
+        Args:
+            scores: (S,) verdicts; of each value there is one at least.
+            levels: (S,) taken for numbers.
+            mean: (S,) of the levels, each predicted from all other verdicts.
+            variance: (S,) of the same.
+
+        Returns:
+            The scale, and by which factor and shift a level goes over into its unit.
+        """
+        learnt = self.learnt(scores, mean, variance)
+        expected = learnt.expected(scores, mean, variance)[0]
+        several = len(learnt.values) > 1
+        factor = float(levels.std() / (expected.std() or 1.0)) if several else 1.0
+        factor = min(max(factor, 1 / MOST_CHANGE), MOST_CHANGE)
+        shift = float(levels.mean() - factor * expected.mean())
+        return learnt.moved(factor, shift), factor, shift
 
     def log_likelihood(self, scores: F64, mean: F64, variance: F64) -> float:
         """Of verdicts (S,), their levels distributed as stated."""
