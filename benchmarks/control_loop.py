@@ -8,6 +8,10 @@ reset, so that every period has a control step. For each step the robot node not
 its deadline the step began. A deadline is missed where a step began a whole period late, so that
 no command left in that period.
 
+With --strangers, nodes of others come, go, are killed and held in the same ROS domain meanwhile
+(strangers.py). Else it is as quiet as ROS_DOMAIN_ID makes it. The load of the machine is looked at
+every ten seconds.
+
 A line for each call goes to results/control_loop.csv, the table to results/control_loop.md. A run
 that is stopped (Ctrl-C) still has a line, of what was measured until its last phase.
 """
@@ -19,7 +23,10 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +35,7 @@ from rows import Rows
 
 import machine
 from codetr_ros.bags.reader import Bag
+from codetr_ros.processes import middleware
 from codetr_ros.records import Metrics
 
 HERE = Path(__file__).parent
@@ -43,6 +51,8 @@ SHOWN = {
     'late_ms_p99.9': '99.9 %',
     'late_ms_max': 'most',
 }
+LOOK_EVERY = 10.0  # [s] at the load
+STARTING = 20.0  # [s] until a run has its first phase
 
 
 def example(folder: Path, rate: float, minutes: float) -> int:
@@ -70,12 +80,57 @@ def measured(bag: Path) -> dict[str, float]:
     return newest
 
 
+class Load:
+    """Looks at the load of the machine every so often, in a thread of its own.
+
+    Attributes:
+        seen: the averages of the last minute.
+    """
+
+    def __init__(self) -> None:
+        self.seen: list[float] = []
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._look, daemon=True)
+
+    def _look(self) -> None:
+        while not self._over.wait(LOOK_EVERY):
+            self.seen.append(os.getloadavg()[0])
+
+    def __enter__(self) -> 'Load':
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def __str__(self) -> str:
+        if not self.seen:
+            return 'unknown'
+        return f'{sum(self.seen) / len(self.seen):.1f} (most {max(self.seen):.1f})'
+
+
+@contextmanager
+def strangers(seconds: float) -> Iterator[None]:
+    """Nodes of others come and go meanwhile, from some seconds after the begin on."""
+    lasting = str(max(0.0, seconds - STARTING))
+    command = [sys.executable, str(HERE / 'strangers.py'), lasting, str(STARTING)]
+    environment = middleware.DEFAULTS | os.environ
+    process = subprocess.Popen(command, env=environment)
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.wait()
+
+
 def main() -> int:
     """Measure, and write the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--minutes', type=float, default=60.0)
     parser.add_argument('--rate', type=float, default=50.0, help='control steps a second')
     parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--strangers', action='store_true', help='others come and go meanwhile')
     parser.add_argument('--keep', type=Path, help='keep the folder of the run here')
     parser.add_argument('--dry', action='store_true', help='write no results')
     given = parser.parse_args()
@@ -85,14 +140,17 @@ def main() -> int:
         steps = example(copy, given.rate, given.minutes)
         command = [sys.executable, '-m', 'codetr_ros.cli', 'demo', 'robot', '--out', str(out)]
         command += ['--seed', str(given.seed), '--example', str(copy)]
-        code = subprocess.run(command, check=False).returncode
+        beside = strangers(60 * given.minutes) if given.strangers else nullcontext()
+        with Load() as during, beside:
+            code = subprocess.run(command, check=False).returncode
         found = measured(out / 'bag')
     row = {
         'commit': machine.commit(),
         'processor': machine.processor(),
         'cores': os.cpu_count(),
         'load before': load,
-        'load after': f'{os.getloadavg()[0]:.2f}',
+        'load meanwhile': str(during),
+        'strangers': 'come and go' if given.strangers else 'none started',
         'rate': given.rate,
         'steps asked for': steps,
         'minutes': round((time.monotonic() - began) / 60, 1),
@@ -109,12 +167,14 @@ def main() -> int:
 
 def table(everything: list[dict[str, str]]) -> str:
     """The results as a page."""
-    head = ['rate [Hz]', 'control steps', 'missed', *SHOWN.values(), 'cores', 'load', 'commit']
+    head = ['rate [Hz]', 'control steps', 'missed', *SHOWN.values(), 'cores', 'load']
+    head += ['other nodes', 'commit']
     lines = [
         '# Lateness of control steps [ms], beside the learner',
         '',
-        'Made by `benchmarks/control_loop.py`. The load is the average of the last minute before '
-        'and after; the nodes themselves are in the second.',
+        'Made by `benchmarks/control_loop.py`. The load is the average of the last minute, looked '
+        'at every ten seconds; the nodes themselves are in it. Other nodes: those that the '
+        'benchmark let come, go, be killed and held in the same ROS domain (`--strangers`).',
         '',
         f'| {" | ".join(head)} |',
         f'|{"---:|" * len(head)}',
@@ -122,7 +182,7 @@ def table(everything: list[dict[str, str]]) -> str:
     for row in everything:
         cells = [row['rate'], *(row[n].removesuffix('.0') for n in MEASURED[:2])]
         cells += [row[name] for name in SHOWN]
-        cells += [row['cores'], f'{row["load before"]}, {row["load after"]}', row['commit']]
+        cells += [row['cores'], row['load meanwhile'], row['strangers'], row['commit']]
         lines.append(f'| {" | ".join(cells)} |')
     return '\n'.join(lines) + '\n'
 

@@ -19,6 +19,7 @@ setup(
     package_data={
         'codetr_ros': ['py.typed'],
         'codetr_ros.config.presets': ['*.yaml'],
+        'codetr_ros.processes': ['*.xml'],
         'codetr_ros.bags': ['msg/*.msg'],
         'codetr_ros.runs.recorded': ['*.json'],
         'codetr_ros.pages': ['static/*', 'static/uplot/*'],

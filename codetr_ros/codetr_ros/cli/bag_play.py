@@ -1,7 +1,6 @@
 """`codetr bag play`: a recorded run, published again for nodes that learn from it."""
 
 import dataclasses
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -93,8 +92,7 @@ def main(arguments: Sequence[str]) -> int:
             f'playing needs ROS, which cannot be imported ({error}): `codetr doctor` names what '
             'is missing; `codetr fit` learns from bags without it'
         )
-    for variable, value in middleware.DEFAULTS.items():
-        os.environ.setdefault(variable, value)
+    middleware.set_defaults()
     code: int = player.play(
         recorded,
         lambda: items(bag, recorded.run.run_id),

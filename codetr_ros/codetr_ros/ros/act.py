@@ -239,4 +239,4 @@ def run_act(argv: Iterable[str] | None = None, stop: Stop | None = None) -> int:
         logging.getLogger('codetr_ros').addHandler(ToRos(node.log))
         return node.run()
 
-    return in_ros('act', argv, stop, be_it)
+    return in_ros('act', argv, stop, be_it, punctual=True)

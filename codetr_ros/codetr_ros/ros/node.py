@@ -21,6 +21,7 @@ from typing import Any
 
 from codetr_ros.nodes import errors
 from codetr_ros.nodes.attention import Attention
+from codetr_ros.processes.launcher import ROBOT_NODE
 from codetr_ros.records import TOPICS
 from codetr_ros.ros import joining
 from codetr_ros.ros.gathering import IDLE, wait_for
@@ -297,4 +298,4 @@ def run_node(
         join = partial(joining.join, load_core=load_core, announce=announce, looks_on=looks_on)
         return Node(member, join, wire).run()
 
-    return in_ros(name, argv, stop, be_it)
+    return in_ros(name, argv, stop, be_it, punctual=kind == ROBOT_NODE)

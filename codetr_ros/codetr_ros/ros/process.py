@@ -41,6 +41,7 @@ def in_ros(
     argv: Iterable[str] | None,
     stop: Stop | None,
     body: Callable[[Sequence[str], Stop], int],
+    punctual: bool = False,
 ) -> int:
     """Initialise ROS, do what a node does, and end ROS.
 
@@ -49,14 +50,16 @@ def in_ros(
         argv: command line without the program; None: that of the process.
         stop: handlers of signals that are installed already; None: install them here.
         body: is the node, given the command line and the handlers; returns the exit code.
+        punctual: whether it must not wait for other nodes where it sends.
 
     Returns:
         Exit code: that of the body, or 2 for arguments that ROS cannot read.
     """
     stop = stop or Stop().install()
     stop.started()
-    for variable, value in middleware.DEFAULTS.items():
-        os.environ.setdefault(variable, value)
+    middleware.set_defaults()
+    if punctual:
+        middleware.avoid_shared_memory(rclpy.get_rmw_implementation_identifier())
     arguments = sys.argv if argv is None else [name, *argv]
     code: int | None = None
     try:
