@@ -30,9 +30,7 @@ from codetr_ros.runs import folder as run_folder
 from helpers import forked
 
 PATIENCE = 120.0  # [s] a busy machine starts five nodes in 40
-PEER_DEADLINE = (
-    2 * PATIENCE
-)  # [s] a node that a test holds is not given up before the test gives up
+PEER_DEADLINE = 2 * PATIENCE  # [s] a test gives up before others do on a node that it holds
 RUN_ID = 'run'
 NAMESPACE = f'/run_{RUN_ID}'
 
