@@ -22,6 +22,7 @@ MODULES = {
     'deaf': 'helpers.deaf',
     'uncommitted': 'helpers.deaf:uncommitted',
     'unannounced': 'helpers.deaf:unannounced',
+    'unpermitted': 'helpers.deaf:unpermitted',
     'imports': 'helpers.slow_import',
     'compiles': 'helpers.slow_import:compiling',
 }

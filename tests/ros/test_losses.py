@@ -135,6 +135,32 @@ def test_what_a_source_has_announced_is_asked_for_if_it_was_lost(play, tmp_path)
 
 
 @pytest.mark.slow
+def test_permission_for_a_phase_is_asked_for_if_it_was_lost(play, tmp_path):
+    play = play(settings=settings(), roles=('learner', 'record', 'reward'))
+    learner = play.links['learner']
+    outbox = Outbox(phase_steps=5, phases=3)
+    serve_outbox(learner, 'run', outbox)
+    with process('unpermitted', f'folder:={tmp_path}', 'peer_deadline:=60.0') as node:
+        play.until(lambda: play.messages('TaskSpec', 'record'), node)
+        for record in (
+            policy(steps=np.array([5], np.uint32)),
+            policy(phase=1, version=0, steps=np.array([0], np.uint32)),
+        ):
+            outbox.keep(record)
+            learner.publish(record)
+        play.until(lambda: play.presence_of('sim')[-1].finished)
+        play.finished = True
+        play.until(lambda: node.poll() is not None)
+        said = output(node)
+    assert node.returncode == 0, said
+    assert 'permission for phase 0 had not arrived: it came again' in said
+    assert [m.phase_end for m in play.messages('Transitions', 'record')] == [True]
+    report = json.loads(run_folder.report_path(tmp_path, 'sim', 'sim').read_text())
+    assert report['lost'] == report['duplicated'] == {}
+    assert report['fetched'] == {'policy': 2}
+
+
+@pytest.mark.slow
 def test_what_was_lost_of_an_early_phase_is_asked_for_though_later_ones_are_whole(play, tmp_path):
     """A network that was cut: what no commit names, such as true rewards, is noticed late."""
     phases = 6

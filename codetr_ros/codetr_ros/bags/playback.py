@@ -189,7 +189,7 @@ class Playback:
         commits: completes the commits; None: they go out as they were recorded.
     """
 
-    missing = unlabelled = uncommitted = None  # it takes no phases in
+    missing = unlabelled = uncommitted = unpermitted = None  # it takes no phases in
     unannounced = False
     due = None
 

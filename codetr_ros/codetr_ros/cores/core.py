@@ -37,6 +37,10 @@ class Core(Protocol[Given_co]):
         """Whether it has to know what all sources simulate, and does not yet."""
 
     @property
+    def unpermitted(self) -> int | None:
+        """The phase that it will run once it is permitted; None if there is none."""
+
+    @property
     def due(self) -> int | None:
         """The next phase to be finished here; None if there are none here."""
 
@@ -100,6 +104,11 @@ class Part:
     def unannounced(self) -> bool:
         """Whether it has to know what all sources simulate, and does not yet."""
         return False
+
+    @property
+    def unpermitted(self) -> int | None:
+        """The phase that it will run once it is permitted; None if there is none."""
+        return None
 
     @property
     def due(self) -> int | None:

@@ -173,6 +173,11 @@ class Simulator(Part):
         return not self.finished and self._phase not in self._waiting
 
     @property
+    def unpermitted(self) -> int | None:
+        """The phase that it will run once it is permitted; None if there is none."""
+        return self._phase if self.lacks_permission else None
+
+    @property
     def due(self) -> int:
         """The next phase to be run."""
         return self._phase

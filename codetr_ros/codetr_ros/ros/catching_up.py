@@ -1,5 +1,5 @@
-"""Fetches what a learner or reward node lacks: committed phases from the recorder, labels from the
-reward node, what a source simulates from its simulator.
+"""Fetches what a node lacks: committed phases from the recorder, labels from the reward node, what
+a source simulates from its simulator, permission for a phase from the learner.
 """
 
 import time
@@ -13,6 +13,7 @@ from codetr_ros.records import (
     TOPICS,
     Commit,
     CompositeReward,
+    Policy,
     Preference,
     StepRewards,
     TaskSpec,
@@ -33,7 +34,7 @@ TakeAgain = Callable[..., object]
 
 
 class Fetcher:
-    """Asks for a phase, or for labels, that stay incomplete.
+    """Asks for what is awaited, and does not come.
 
     Args:
         link: the node's connection.
@@ -55,7 +56,8 @@ class Fetcher:
         self._recorder = Asker(link, SERVICE, run_id)
         self._askers: dict[str, Asker] = {}  # of other nodes, by the names of their services
         self._phases, self._labels, self._commits = Fetching(), Fetching(), Fetching()
-        self._tasks = Fetching()
+        self._tasks, self._permissions = Fetching(), Fetching()
+        self._permitted = Offered()
         self._offered, self._committed = Offered(), Offered()
         self._kinds: tuple[type, ...] = ()  # that the core takes in
         self._fetched: Callable[[int], None]  # lets the core know that a phase was sent again
@@ -75,6 +77,10 @@ class Fetcher:
             self._ask_commit(uncommitted)
         if self._tasks.due(0 if core.unannounced else None, now):
             self._ask_sources()
+        unpermitted = core.unpermitted
+        if self._permissions.due(unpermitted, now):
+            assert unpermitted is not None
+            self._ask_learner(unpermitted)
         behind = unlabelled is not None and unlabelled <= self.behind
         if self._labels.due(unlabelled, now, behind):
             assert unlabelled is not None
@@ -120,6 +126,18 @@ class Fetcher:
         for kind, data in answer.messages:
             self._log.warning('what a source has announced had not arrived: it came again')
             self._take(kind, data)
+
+    def _ask_learner(self, phase: int) -> None:
+        """Ask for the policy that permits a phase: most often it is still to be learnt."""
+        for asker in self._nodes('learner')[:1]:
+            kinds = [type_name(Policy)]
+            asker.ask(phase, lambda answer: self._offered_policy(phase, answer), kinds)
+
+    def _offered_policy(self, phase: int, answer: Answer) -> None:
+        if answer.messages and self._permitted.lost(phase, time.monotonic()):
+            self._log.warning(f'permission for phase {phase} had not arrived: it came again')
+            for kind, data in answer.messages:
+                self._take(kind, data)
 
     def _nodes(self, role: str) -> list[Asker]:
         """Those that ask the nodes of a role which are there and answer."""

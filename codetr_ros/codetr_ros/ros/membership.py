@@ -192,7 +192,7 @@ class Membership:
         self._serves = True
         if self.run is not None:
             self.traffic.run_id = self.run.run_id
-        if self.run is not None and Commit in core.subscribes:
+        if self.run is not None and (Commit in core.subscribes or self.role == 'sim'):
             take = self.traffic.take_again
             self._fetcher = Fetcher(self.link, self.run.run_id, self.peers, take)
 
