@@ -5,6 +5,7 @@ import os
 import sys
 from collections.abc import Iterator
 from functools import cache
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +25,14 @@ ROS = importlib.util.find_spec('rclpy') is not None
 collect_ignore_glob = [] if ROS else ['ros/*', 'graph/*']
 
 
+PENDING = 4
+"""More units than pytest-xdist gives to a process before it has done the first of them."""
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Where tests run side by side, those that share a fixture of their module stay together.
+    """Where tests run side by side, those that share a fixture of their module stay together, and
+    at most every second process has whole runs, each of which is half a dozen processes more.
 
     (pytest-xdist's own groups, `--dist loadgroup`, have no effect with pytest 9.2.)
     """
@@ -37,7 +43,24 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
             module = nodeid.split('::', maxsplit=1)[0]
             return module if shares_a_fixture(config.rootpath / module) else nodeid
 
+        def _has_whole_runs(self, node: Any) -> bool:
+            newest = islice(reversed(self.assigned_work.get(node, {}).items()), PENDING)
+            return any(is_whole_run(scope) and not all(unit.values()) for scope, unit in newest)
+
+        def _assign_work_unit(self, node: Any) -> None:
+            busy = sum(self._has_whole_runs(other) for other in self.nodes if other is not node)
+            wanted = not busy or 2 * (busy + 1) <= len(self.nodes)
+            first = next((s for s in self.workqueue if is_whole_run(s) == wanted), None)
+            if first is not None:
+                self.workqueue.move_to_end(first, last=False)
+            super()._assign_work_unit(node)
+
     return BySharedFixture(config, log) if config.getvalue('dist') == 'loadscope' else None
+
+
+def is_whole_run(nodeid: str) -> bool:
+    """Whether a test, or a module of tests, is one of whole runs over topics."""
+    return nodeid.startswith('tests/graph/')
 
 
 @cache
