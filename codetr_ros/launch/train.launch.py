@@ -10,9 +10,10 @@ a node fails otherwise, the launch ends the others and returns an exit code othe
 evaluator may fail, and its results are missing then. The launch starts all simulators of the run,
 unless the argument `start_simulators` is false: then each is started by hand, on any machine and
 with a name of its own, `ros2 run sim_node sim --ros-args -r __ns:=/codetr -r __node:=sim_2`.
+
+On a robot (task robot/NAME) its node is started in place of simulators: `mapping:=FILE`.
 """
 
-import signal
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -35,8 +36,10 @@ from launch_ros.actions import Node
 
 from codetr_ros.config import USUAL, Settings, from_text, load
 from codetr_ros.nodes import signing
+from codetr_ros.processes.launcher import ROBOT_NODE
 from codetr_ros.processes.restarts import MOST, WITHIN, Restarts, wrong
 from codetr_ros.records.roles import TABLE
+from codetr_ros.ros.launches import STOP_DEADLINE, NodeFailedError, check, how_it_ended
 from codetr_ros.ros.parameters import FIELDS, as_parameters
 
 ARGUMENTS = {
@@ -55,37 +58,17 @@ ARGUMENTS = {
     ),
     'restarts_within': (f'{WITHIN:g}', 'seconds'),
     'restart_delay': ('1.0', 'seconds until a node that was killed is started again'),
-    'start_simulators': ('true', 'false: simulators are started by hand, on any machine'),
+    'start_simulators': (
+        'true',
+        'false: simulators, or the robot node, are started by hand, on any machine',
+    ),
+    'mapping': ('', 'on a robot: the mapping file, which names its topics and limits'),
+    'autostart': (
+        'false',
+        'on a robot: true moves it as soon as everybody is there; false: once it is activated',
+    ),
 }
-STOP_DEADLINE = '20'
-"""Seconds from SIGINT to SIGTERM, and from there to SIGKILL, in which a node ends its slice and
-writes a checkpoint.
-"""
-
-
-class NodeFailedError(RuntimeError):
-    """A node of the run has failed, or an argument is refused. Of all that a launch file can do,
-    only an error makes `ros2 launch` return another exit code than 0.
-    """
-
-
-def check(event: ProcessExited, context: LaunchContext) -> None:
-    """End the launch with an error if a node has failed.
-
-    Raises:
-        NodeFailedError: it has an exit code other than 0, and was not merely ended by the SIGINT
-            that ends a launch.
-    """
-    stopped = context.is_shutdown and event.returncode == -signal.SIGINT
-    if event.returncode and not stopped:
-        raise NodeFailedError(f'{how_it_ended(event)}: the run has failed, see its output')
-
-
-def how_it_ended(event: ProcessExited) -> str:
-    """How a process ended, for people."""
-    code = event.returncode
-    how = f'ended with exit code {code}' if code >= 0 else f'was ended by signal {-code}'
-    return f'{event.process_name} {how}'
+ON_ROBOT = ('mapping', 'autostart')
 
 
 @dataclass
@@ -170,6 +153,26 @@ def settings_of(context: LaunchContext) -> tuple[Settings, dict[str, Any]]:
     return from_text(base, given, 'train.launch.py')
 
 
+def moving(settings: Settings, context: LaunchContext) -> tuple[str, ...]:
+    """The names of the simulators, or that of the node that drives the robot.
+
+    Raises:
+        NodeFailedError: a robot lacks its mapping, or a simulation has one.
+    """
+    mapping = LaunchConfiguration('mapping').perform(context)
+    if settings.on_robot and not mapping:
+        raise NodeFailedError(
+            f'task = {settings.task} is that of a robot, which needs mapping:=FILE; '
+            'docs/your-robot.md has an example. To start its node by hand: start_simulators:=false'
+        )
+    if mapping and not settings.on_robot:
+        raise NodeFailedError(
+            f'mapping:={mapping} is of a robot, and task = {settings.task} is none: set the task '
+            'to robot/NAME, or leave the mapping out'
+        )
+    return (ROBOT_NODE,) if settings.on_robot else settings.simulator_names
+
+
 def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     """The nodes; only the learner gets settings, and the others take them from the run."""
     value = {name: LaunchConfiguration(name) for name in ARGUMENTS}
@@ -178,23 +181,24 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     own = {
         'learner': {'config': value['config'], **as_parameters(given)},
         'record': {'leave_out_after': value['leave_out_after']},
+        ROBOT_NODE: {name: value[name] for name in ON_ROBOT},
     }
     named = {role: role for role in settings.roles if role != 'sim'}
     if value['start_simulators'].perform(context).lower() == 'true':
-        named |= dict.fromkeys(settings.simulator_names, 'sim')
+        named |= dict.fromkeys(moving(settings, context), 'sim')
     key = signing.environment()  # that only these nodes have
     restarts, delay = restarts_of(context)
 
     def node(name: str, role: str) -> Node:
         return Node(
             package=TABLE[role].package,
-            executable=TABLE[role].executable,
+            executable=name if name == ROBOT_NODE else TABLE[role].executable,
             name=name if role == 'sim' else TABLE[role].executable,
             namespace=value['namespace'],
             output='screen',
             sigterm_timeout=STOP_DEADLINE,
             sigkill_timeout=STOP_DEADLINE,
-            parameters=[shared | own.get(role, {})],
+            parameters=[shared | own.get(name if name == ROBOT_NODE else role, {})],
             additional_env=key,
         )
 

@@ -1,6 +1,7 @@
 """What a person may ask of a robot node, where there is no command `ros2`.
 
     .venv/bin/python examples/robot_arm/person.py activate /arm_run
+    .venv/bin/python examples/robot_arm/person.py activate / --node act
 
 With the command `ros2`, the same is `ros2 lifecycle set /arm_run/robot_driver activate` and
 `ros2 service call /arm_run/robot_driver/stop std_srvs/srv/Trigger`.
@@ -38,15 +39,16 @@ def main() -> int:
     """Ask, and print the answer."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('asked', choices=[*CHANGES, *PAUSES, *TRIGGERS])
-    parser.add_argument('namespace', help='of the run, such as /arm_run')
+    parser.add_argument('namespace', help='of the run, such as /arm_run, or of the node')
+    parser.add_argument('--node', default='robot', help='that drives the robot: robot, or act')
     given = parser.parse_args()
     rclpy.init()
     node = rclpy.create_node('person')
     kind, name, request = question(given.asked)
-    client = node.create_client(kind, f'{given.namespace}/robot_driver/{name}')
+    client = node.create_client(kind, f'{given.namespace.rstrip("/")}/{given.node}_driver/{name}')
     try:
         if not client.wait_for_service(10.0):
-            print(f'nobody offers {client.srv_name}: is the robot node there?', file=sys.stderr)
+            print(f'nobody offers {client.srv_name}: is that node there?', file=sys.stderr)
             return 1
         future = client.call_async(request)
         rclpy.spin_until_future_complete(node, future, timeout_sec=10.0)

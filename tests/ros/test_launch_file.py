@@ -1,8 +1,6 @@
 """The launch file: which nodes it starts, and what it gives them."""
 
 import sys
-from importlib.util import module_from_spec, spec_from_file_location
-from pathlib import Path
 
 import pytest
 
@@ -13,28 +11,15 @@ from launch.actions import EmitEvent, ExecuteProcess, RegisterEventHandler
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
 from launch_ros.actions import Node
-from launch_ros.utilities import evaluate_parameters
 
 from codetr_ros.config import USUAL, SettingsError
-
-FILE = Path(__file__).resolve().parents[2] / 'codetr_ros' / 'launch' / 'train.launch.py'
+from helpers.launching import launch_file, parameters
 
 
 @pytest.fixture
 def module():
     """The launch file."""
-    spec = spec_from_file_location('train_launch', FILE)
-    made = module_from_spec(spec)
-    spec.loader.exec_module(made)
-    return made
-
-
-def parameters(node, context):
-    """Names and values of the parameters that a node is given."""
-    found = {}
-    for each in evaluate_parameters(context, node._Node__parameters):
-        found |= each
-    return found
+    return launch_file('train.launch.py')
 
 
 @pytest.fixture
@@ -102,6 +87,28 @@ def test_there_is_an_argument_for_each_usual_setting(module):
 def test_simulators_that_are_started_by_hand_are_left_out(started):
     nodes = started(start_simulators='false', seed='1')
     assert set(nodes) == {'record', 'learner', 'reward', 'evaluate'}
+
+
+ROBOT = ('task: robot/arm', 'pace: free', 'scorer: topic', 'evaluate_every: 0')
+
+
+def test_on_a_robot_its_node_is_started_in_place_of_a_simulator(started):
+    nodes = started(*ROBOT, mapping='live.yaml', autostart='true')
+    assert set(nodes) == {'robot', 'record', 'learner', 'reward'}
+    assert {name: nodes['robot'][name] for name in ('mapping', 'autostart')} == {
+        'mapping': 'live.yaml',
+        'autostart': True,
+    }
+    assert 'mapping' not in nodes['learner']
+    assert started(*ROBOT, mapping='live.yaml')['robot']['autostart'] is False
+    assert set(started(*ROBOT, start_simulators='false')) == {'record', 'learner', 'reward'}
+
+
+def test_a_robot_without_a_mapping_and_a_mapping_without_a_robot_are_refused(started):
+    with pytest.raises(RuntimeError, match=r'robot/arm .* mapping:=FILE'):
+        started(*ROBOT)
+    with pytest.raises(RuntimeError, match=r'live.yaml .* Pendulum-v1'):
+        started('task: Pendulum-v1', mapping='live.yaml')
 
 
 def test_a_setting_that_is_refused_is_named(started):
