@@ -312,3 +312,24 @@ def test_window_labelling_gives_every_step_a_label_in_the_place_it_belongs():
         if isinstance(record, StepRewards):
             assert len(record.labels) == record.lengths.sum() and np.isfinite(record.labels).all()
     assert sum(isinstance(record, StepRewards) for record in seen) >= 5
+
+
+def test_a_committed_phase_that_a_core_has_still_to_permit_is_not_missing():
+    """The core learns again: it asks for one phase after the other, as it can take them in."""
+    settings = tiny()
+    core = Learner(run(settings), settings, 'learner', None)
+    core.receive(task_spec())
+    core.catch_up(9)
+    episode, work = Endless(settings), core.work()
+    slices(work)  # permits the first phase
+    asked = []
+    for phase in range(2):
+        asked.append((core.missing, core.unlabelled))
+        episode.phase(core, phase)
+        slices(work)
+    assert asked == [(0, None), (1, None)]
+    assert (core.due, core.permitted) == (2, 1)
+    assert (core.missing, core.uncommitted, core.unlabelled) == (None, None, 1)
+    core.receive(step_rewards(phase=1, commit=episode.commits[1]))
+    slices(work)
+    assert (core.missing, core.permitted) == (2, 2)

@@ -9,6 +9,7 @@ from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.verify import verify
 from codetr_ros.config import settled
 from codetr_ros.cores import in_process
+from codetr_ros.cores.preparing import for_nodes
 from codetr_ros.cores.taking_up import take_up
 from codetr_ros.runs import checkpoints
 from helpers.builders import tiny
@@ -175,3 +176,32 @@ def test_a_bag_that_is_damaged_before_its_last_commit_is_refused(halfway):
     bag.write_bytes(content)
     with pytest.raises(BagError, match='a commit lies behind it'):
         take_up(settings, 'run', folder)
+
+
+def test_a_run_whose_bag_is_gone_is_not_begun_anew_beside_its_checkpoints(halfway):
+    settings, folder, _ = halfway
+    shutil.rmtree(folder / 'bag')
+    for go_on in (take_up, for_nodes):
+        with pytest.raises(BagError, match='there is no bag .* Restore it from a copy, or start'):
+            go_on(settings, 'run', folder)
+    assert list((folder / 'checkpoints').iterdir())
+
+
+def test_checkpoints_that_fit_no_bag_or_no_learner_are_removed_before_nodes_go_on(halfway, caplog):
+    settings, folder, _ = halfway
+    where = folder / 'checkpoints'
+    newest = checkpoints.latest(where, 'learner')
+    learnt = checkpoints.phase_of(newest)
+    for phase in (learnt + 1, learnt + 2):
+        shutil.copytree(newest, where / f'reward-{phase:06}')
+    for_nodes(settings, 'run', folder)
+    assert checkpoints.latest(where, 'learner') == newest
+    kept = checkpoints.phase_of(checkpoints.latest(where, 'reward'))
+    assert kept == learnt + 1, 'the labels of this phase are published again'
+    assert f'the learner goes on from phase {learnt}, and needs all labels since' in caplog.text
+
+    (bag,) = (folder / 'bag').glob('*.mcap')
+    bag.write_bytes(bag.read_bytes()[:3000])
+    for_nodes(settings, 'run', folder)
+    assert list(where.iterdir()) == []
+    assert 'no phase was committed: the run begins from its start' in caplog.text

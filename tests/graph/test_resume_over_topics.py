@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from kills import phase_of
 
 from codetr_ros.bags.verify import verify
 from codetr_ros.cores import in_process
+from codetr_ros.ros.membership import KEPT_PHASES
 from codetr_ros.runs import origin
 from helpers.builders import tiny
 from helpers.forked import codetr
@@ -38,6 +40,14 @@ def resumed(folder: Path, *flags: str):
     return finish(codetr('train', *flags, environment=ENVIRONMENT), folder)[0]
 
 
+def kill(command, folder: Path) -> None:
+    """Kill all processes of a run at once."""
+    nodes = [node_of(folder, path.stem) for path in (folder / 'logs').glob('*.log')]
+    for number in (command.pid, *nodes):
+        os.kill(number, signal.SIGKILL)
+    command.communicate()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize('overlap', [False, True], ids=['lock-step', 'overlap'])
 def test_a_run_all_of_which_is_killed_goes_on_and_gets_longer_and_has_the_same_weights(
@@ -46,10 +56,7 @@ def test_a_run_all_of_which_is_killed_goes_on_and_gets_longer_and_has_the_same_w
     settings, folder = SETTINGS.changed({'overlap': overlap}), tmp_path / 'run'
     command = start(write(settings, folder), folder)
     until(lambda: phase_of(folder) >= 3, command, folder)
-    nodes = [node_of(folder, path.stem) for path in (folder / 'logs').glob('*.log')]
-    for number in (command.pid, *nodes):
-        os.kill(number, signal.SIGKILL)
-    command.communicate()
+    kill(command, folder)
     summary = resumed(folder)
     assert weights(summary) == digests(settings)
     assert len(origin.read(folder).resumed) == 1
@@ -63,3 +70,20 @@ def test_a_run_all_of_which_is_killed_goes_on_and_gets_longer_and_has_the_same_w
     assert verify(folder / 'bag').sound
     assert summary['evaluations_missing'] == 0
     assert json.loads((folder / 'summary.json').read_text())['settings']['steps'] == 2400
+
+
+@pytest.mark.slow
+def test_a_run_without_checkpoints_is_learnt_again_from_its_bag(tmp_path):
+    """By both sides at once, over more phases than the reward node keeps labels of."""
+    settings = SETTINGS.changed(
+        {'overlap': True, 'steps': 2400, 'phase_steps': 100, 'evaluate_every': 0}
+    )
+    folder = tmp_path / 'run'
+    command = start(write(settings, folder), folder)
+    until(lambda: phase_of(folder) > settings.warmup_phases + KEPT_PHASES + 3, command, folder)
+    kill(command, folder)
+    shutil.rmtree(folder / 'checkpoints')
+    summary = resumed(folder)
+    assert weights(summary) == digests(settings)
+    assert verify(folder / 'bag').sound
+    assert 'there is no checkpoint to go on from' in (folder / 'logs/learner.log').read_text()

@@ -191,7 +191,7 @@ class Playback:
 
     missing = unlabelled = uncommitted = unpermitted = None  # it takes no phases in
     unannounced = False
-    due = None
+    due = permitted = None
 
     def __init__(
         self,

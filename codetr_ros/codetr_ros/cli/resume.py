@@ -114,19 +114,19 @@ def _finished(folder: Path, settings: Settings) -> bool:
     return over and summary.steps >= settings.steps
 
 
-def lengthen(settings: Settings, run_id: str, folder: Path) -> list[str]:
-    """Prepare a run over topics that goes on with more steps; what people should know.
+def prepare(settings: Settings, run_id: str, folder: Path) -> list[str]:
+    """Prepare the folder of a run over topics; what people should know.
 
     Raises:
         RunFolderError: its bag is damaged, or not of this run.
         OSError: it cannot be written.
     """
     from codetr_ros.bags.errors import BagError
-    from codetr_ros.cores import taking_up
+    from codetr_ros.cores import preparing
 
     notes: list[str] = []
     try:
-        taking_up.lengthen(settings, run_id, folder, notes.append)
+        preparing.for_nodes(settings, run_id, folder, notes.append)
     except BagError as error:
         raise RunFolderError(str(error)) from error
     return notes

@@ -226,7 +226,7 @@ def train(
     notes: list[str] = []
     try:
         if begun is not None:
-            notes = [] if in_process else resume.lengthen(settings, run_id, folder)
+            notes = [] if in_process else resume.prepare(settings, run_id, folder)
             notes += resume.begin(folder, begun, settings)
             run_folder.forget_reports(folder)
         else:

@@ -60,7 +60,7 @@ class Consumer(Part, ABC):
         self._folder = folder
         self._scores = scores
         self._true_rewards = true_rewards
-        self._intake = Intake(run, settings, scores, true_rewards, self._newest_permitted)
+        self._intake = Intake(run, settings, scores, true_rewards, lambda: self.permitted)
         self._memory: Trajectories | None = None
         self._phase = 0  # the next to be learnt from
         self._saved = -1
@@ -75,13 +75,17 @@ class Consumer(Part, ABC):
     def missing(self) -> int | None:
         """A committed phase that is incomplete; None if there is none."""
         due = self._intake.due
-        return due if due <= self._committed else self._intake.missing
+        # one that this node has still to permit is committed, but cannot be taken in yet
+        if due <= min(self._committed, self.permitted):
+            return due
+        return self._intake.missing
 
     @property
     def uncommitted(self) -> int | None:
         """The phase whose commit comes next; None if it has come, or there is none."""
         commits = self._intake.commits
-        more = commits.next < self._settings.phases and not commits.of(commits.next)
+        newest = min(self.permitted, self._settings.phases - 1)
+        more = commits.next <= newest and not commits.of(commits.next)
         return commits.next if more and self.missing is None else None
 
     @property
@@ -108,7 +112,8 @@ class Consumer(Part, ABC):
         """What the next slice waits for, for people."""
         return self._intake.waiting_for()
 
-    def _newest_permitted(self) -> int:
+    @property
+    def permitted(self) -> int:
         """The newest phase that can have been permitted: the learner has learnt from one, and
         permits those that it is then ahead of.
         """

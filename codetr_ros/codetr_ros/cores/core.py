@@ -45,6 +45,10 @@ class Core(Protocol[Given_co]):
         """The next phase to be finished here; None if there are none here."""
 
     @property
+    def permitted(self) -> int | None:
+        """The newest phase that can have been permitted; None if that is not known here."""
+
+    @property
     def unlabelled(self) -> int | None:
         """A phase whose labels are awaited; None if there is none."""
 
@@ -113,6 +117,11 @@ class Part:
     @property
     def due(self) -> int | None:
         """The next phase to be finished here; None if there are none here."""
+        return None
+
+    @property
+    def permitted(self) -> int | None:
+        """The newest phase that can have been permitted; None if that is not known here."""
         return None
 
     def fetched(self, phase: int) -> None:

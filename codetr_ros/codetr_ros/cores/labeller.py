@@ -204,10 +204,11 @@ class Labeller(Consumer):
                 )
             self._counters[reason] = count
 
-    def _newest_permitted(self) -> int:
+    @property
+    def permitted(self) -> int:
         """As of all consumers. But through the warm-up the learner waits for no labels."""
         warm = self._settings.warmup_phases - 2 + self._settings.ahead
-        return max(super()._newest_permitted(), warm)
+        return max(super().permitted, warm)
 
     def _note_labels(self, phase: int) -> None:
         """Expect the labels just published in the commit that names them."""

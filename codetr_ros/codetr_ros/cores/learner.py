@@ -83,10 +83,10 @@ class Learner(Consumer):
                 f'{int(record.lengths.sum())} steps'
             )
         check_labels(record, self._settings)
-        if record.phase > self._newest_permitted():
+        if record.phase > self.permitted:
             raise RecordError(
                 f'{describe(record)} has labels of phase {record.phase}, and phase '
-                f'{self._newest_permitted()} is the newest that is permitted: stop what '
+                f'{self.permitted} is the newest that is permitted: stop what '
                 'publishes them'
             )
         made_of = self._intake.commits.digest(record.phase)

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import torch
 
-from codetr_ros.bags.cutting import Cut, announced, cut
+from codetr_ros.bags.cutting import Cut, announced
 from codetr_ros.bags.definitions import decode
 from codetr_ros.bags.errors import BagError
 from codetr_ros.bags.raw import RawMessage
 from codetr_ros.bags.reopening import reopen
 from codetr_ros.config import Settings, from_canonical, settled
-from codetr_ros.cores import going_on
+from codetr_ros.cores import going_on, preparing
 from codetr_ros.cores.consumer import Consumer
 from codetr_ros.cores.in_process import Parts, driven, namespace_of
 from codetr_ros.cores.recording import RunBag
@@ -80,10 +80,11 @@ def prepare(
     torch.set_num_threads(settings.thread_count)
     bag = folder / run_folder.BAG
     before = announced(bag)
+    preparing.check_not_lost(bag, folder)
     if before is not None:
-        _check(before, settings, run_id, bag)
+        preparing.check(before, settings, run_id, bag)
     known = None if before is None else from_canonical(before.settings, str(bag))
-    made = _cut(bag, known, settings, log)
+    made = preparing.cut_back(bag, known, settings, log)
     parts = Parts(settings, run_id, folder, observe, tick)
     _Past(parts, folder, made, past, log).restore()
     return parts
@@ -92,80 +93,6 @@ def prepare(
 def take_up(settings: Settings, run_id: str, folder: Path) -> dict[str, NodeReport]:
     """Go on with a run in process to its end; the errors are those of `prepare`."""
     return driven(prepare(settings, run_id, folder))
-
-
-def lengthen(
-    settings: Settings, run_id: str, folder: Path, log: Callable[[str], None] = _log.warning
-) -> None:
-    """Prepare the folder of a run over topics that goes on with more steps than it began with, if
-    it does: its nodes then restore themselves. The last policy, for example, has permitted nothing
-    more, and is published anew.
-
-    Args:
-        settings: the run's settings; only `steps` may be others than before, and more.
-        run_id: its name.
-        folder: its folder.
-        log: takes what people should know, a line at a time.
-
-    Raises:
-        BagError: the bag is damaged before its last commit, of another run or of other settings.
-        OSError: it cannot be written.
-    """
-    settings, bag = settled(settings), folder / run_folder.BAG
-    before = announced(bag)
-    if before is None:
-        return
-    _check(before, settings, run_id, bag)
-    known = from_canonical(before.settings, str(bag))
-    if known.steps == settings.steps:
-        return
-    commit = _cut(bag, known, settings, log).commit
-    # all that was learnt up to there lies before the commit
-    newest = -1 if commit is None else commit.phase - settings.lag
-    if known.warmup_phases != settings.warmup_phases:
-        newest = -1  # at the end of its warm-up the shorter run has learnt
-    for role in ('reward', 'learner'):
-        checkpoints.remove_after(folder / run_folder.CHECKPOINTS, role, newest)
-
-
-def _check(before: RunSpec, settings: Settings, run_id: str, bag: Path) -> None:
-    """Refuse a bag of another run, or of other settings than `steps`."""
-    if before.run_id != run_id:
-        raise BagError(f'bag {bag} holds run {before.run_id!r}, not {run_id!r}')
-    if changed := going_on.other_settings(before.settings, settings, str(bag)):
-        raise BagError(
-            f'bag {bag} is of a run with {changed}: a run goes on with the settings that it began '
-            f'with, only {", ".join(going_on.MAY_CHANGE)} may change'
-        )
-
-
-def _cut(
-    bag: Path, before: Settings | None, settings: Settings, log: Callable[[str], None]
-) -> Cut:
-    """Cut the bag back to the last commit of a phase that has all its steps."""
-
-    def announcement(spec: RunSpec) -> RunSpec:
-        new = settings.run_spec(spec.run_id)
-        return spec if new.settings == spec.settings else new
-
-    newest = None
-    if before is not None:
-        last = before.phases - 1
-        if before.steps_of(last) != settings.steps_of(last):
-            newest = last - 1
-            log(
-                f'phase {last} had {before.steps_of(last)} of {settings.steps_of(last)} steps, '
-                'as the last of a shorter run: it is done again'
-            )
-    made = cut(bag, announcement, newest)
-    left_out = +made.left_out
-    if made.commit is not None:
-        gone = ', '.join(f'{n} of {topic}' for topic, n in sorted(left_out.items()))
-        log(
-            f'the bag ends with the commit of phase {made.commit.phase}'
-            + (f'; what came behind it is made again: {gone}' if gone else '')
-        )
-    return made
 
 
 class _Past:
@@ -227,12 +154,10 @@ class _Past:
 
     def _begin_again(self, bag: Path) -> None:
         """Begin from the start in the same folder: nothing has been learnt from."""
-        self._log('no phase was committed: the run begins from its start')
         for path in sorted(bag.iterdir()) if bag.is_dir() else ():
             path.unlink()
-        for name, consumer in self._consumers.items():
-            checkpoints.remove_after(self._folder / run_folder.CHECKPOINTS, name, -1)
-            assert consumer.phase == 0
+        preparing.forget_checkpoints(self._folder, self._log)
+        assert all(consumer.phase == 0 for consumer in self._consumers.values())
         self._parts.bag = RunBag(bag, self._parts.settings, namespace_of(self._parts.spec.run_id))
         self._parts.announce()
 

@@ -2,12 +2,13 @@
 
 from collections.abc import Collection, Iterator
 
-from codetr_ros.records import Presence, Record, RunSpec, TaskSpec
+from codetr_ros.records import Presence, Record, RunSpec, StepRewards, TaskSpec
 from codetr_ros.records.fields import type_name
 from codetr_ros.records.identity import identity, phase_of
 
 NOT_KEPT = (Presence, RunSpec)
 """Published again and again, or by other means."""
+LABELS = type_name(StepRewards)
 
 
 class Outbox:
@@ -29,11 +30,24 @@ class Outbox:
         self._phases: dict[int, dict[object, Record]] = {}
         self._announced: dict[object, TaskSpec] = {}
         self._phase = 0  # of the last record that named one
+        self._asked = -1  # the newest phase of which a reader has asked for the labels alone
 
     @property
     def newest(self) -> int | None:
         """The newest phase of which something is kept; None if nothing is."""
         return max(self._phases, default=None)
+
+    @property
+    def owes(self) -> bool:
+        """Whether one phase more would let go of labels that nobody has asked for. A learner that
+        learns from phases again asks for those of one after the other.
+        """
+        if self._most is None or len(self._phases) < self._most:
+            return False
+        oldest = min(self._phases)
+        return oldest >= self._asked and any(
+            isinstance(record, StepRewards) for record in self._phases[oldest].values()
+        )
 
     def keep(self, record: Record) -> None:
         """Keep a record that is published; one that was published before takes its place."""
@@ -60,6 +74,8 @@ class Outbox:
         Raises:
             KeyError: nothing of it is kept; the message names the phases of which something is.
         """
+        if list(kinds) == [LABELS]:
+            self._asked = max(self._asked, phase)
         if phase not in self._phases:
             held = ', '.join(map(str, sorted(self._phases))) or 'none yet'
             raise KeyError(f'nothing of phase {phase} is kept; of these is: {held}')

@@ -137,11 +137,16 @@ class Traffic:
         """Hold back records of phases until it is certain which phase is the next one here."""
         self._held = []
 
-    def release(self) -> None:
-        """Hand over what was held back, and what comes from now on."""
+    def release(self, later: Callable[[Record], bool] = lambda record: False) -> None:
+        """Hand over what was held back, and what comes from now on.
+
+        Args:
+            later: whether a record is fetched again when its turn has come: it is let go.
+        """
         held, self._held = self._held or [], None
         for record in held:
-            self.receive(record)
+            if not later(record):
+                self.receive(record)
 
     def _holds_back(self, record: Record) -> bool:
         if self._held is None or not isinstance(record, PHASED):

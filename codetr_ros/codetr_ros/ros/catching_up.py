@@ -15,6 +15,7 @@ from codetr_ros.records import (
     CompositeReward,
     Policy,
     Preference,
+    Record,
     StepRewards,
     TaskSpec,
     Transitions,
@@ -62,6 +63,17 @@ class Fetcher:
         self._kinds: tuple[type, ...] = ()  # that the core takes in
         self._fetched: Callable[[int], None]  # lets the core know that a phase was sent again
         self.behind = -1
+
+    def later(self, record: Record, core: Core[Any]) -> bool:
+        """Whether a record is of a phase that is fetched when those before it have been taken in:
+        the node has joined late, and could not hold all that comes meanwhile.
+        """
+        due, permitted = core.due, core.permitted
+        if due is None or permitted is None or due > self.behind:
+            return False
+        if isinstance(record, StepRewards):  # made again now, for one phase after the other
+            return record.phase > permitted
+        return isinstance(record, OF_PHASES)
 
     def check(self, core: Core[Any]) -> None:
         """Ask for what the core has lacked for a while."""

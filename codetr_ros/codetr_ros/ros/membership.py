@@ -26,13 +26,12 @@ from codetr_ros.records import (
     Record,
     RecordError,
     RunSpec,
-    StepRewards,
     describe,
 )
 from codetr_ros.records.bounds import LONGEST_DOING
 from codetr_ros.records.roles import published_by
 from codetr_ros.ros import given, link, parameters
-from codetr_ros.ros.catching_up import OF_PHASES, Fetcher
+from codetr_ros.ros.catching_up import Fetcher
 from codetr_ros.ros.link import Link
 from codetr_ros.ros.own_parameters import core_parameters
 from codetr_ros.ros.resend import serve_outbox
@@ -217,6 +216,10 @@ class Membership:
         if self._fetcher is not None:
             self._fetcher.behind = newest
 
+    def release(self) -> None:
+        """Hand over what was held back while the node joined, and what comes from now on."""
+        self.traffic.release(self._fetched_later)
+
     def begin_counting_anew(self) -> None:
         """Count as lost only what is published from now on and never arrives."""
         traffic = self.traffic
@@ -241,7 +244,7 @@ class Membership:
         self.traffic.expire()
         if time.monotonic() - self._presence_at >= PRESENCE_EVERY:
             self.publish_presence()
-        if self._fetcher is not None and self.begun:
+        if self._fetcher is not None and self.begun and not self.runs_away:
             self._fetcher.check(self.traffic.core)
         for other in self.company:
             other.turn()
@@ -267,10 +270,22 @@ class Membership:
         """Whether a record is of a phase that is fetched when those before it have been taken in:
         the node has joined late, and could not hold all that comes meanwhile.
         """
-        if self._fetcher is None or not isinstance(record, (*OF_PHASES, StepRewards)):
+        return self._fetcher is not None and self._fetcher.later(record, self.traffic.core)
+
+    @property
+    def runs_away(self) -> bool:
+        """Whether this node learns phases again, faster than the learner does, and would soon let
+        go of labels that the learner lacks.
+        """
+        if self._fetcher is None or self._outbox is None or not self._outbox.owes:
             return False
-        missing = self.traffic.core.missing
-        return missing is not None and missing <= self._fetcher.behind
+        due = self.traffic.core.due
+        learners = self.peers.alive('learner')
+        return (
+            due is not None
+            and due <= self._fetcher.behind
+            and any(not peer.presence.finished for peer in learners)
+        )
 
     # ---- runs and peers
 

@@ -103,7 +103,7 @@ class Node:
             member.turn()
             self._sound = False  # until the slice has ended well
             try:
-                given = self._slice(work, worked)
+                given = None if member.runs_away else self._slice(work, worked)
             except Stopped:
                 return
             for each in given or ():

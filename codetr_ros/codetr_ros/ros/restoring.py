@@ -153,7 +153,7 @@ def _has_begun(member: Membership) -> bool:
 
 def _learner(member: Membership, joined: Joined, newest: int, _: _Recorder) -> None:
     core: Any = joined.core
-    phase = core.resume()
+    phase = core.resume(newest)  # a bag that was restored from a copy may end earlier
     member.log.info(f'goes on from the checkpoint of phase {phase}' if phase >= 0 else _ANEW)
     member.catch_up(newest)
 

@@ -68,7 +68,7 @@ class Wiring:
         """
         if not go_on(self.member, self.joined):
             return False
-        self.member.traffic.release()
+        self.member.release()
         return True
 
     def deliver(self, given: Any) -> None:
@@ -95,6 +95,8 @@ class Wiring:
 
     def waits(self) -> str:
         """What the node waits for, in words."""
+        if self.member.runs_away:
+            return 'waits for the learner to take in the labels of the phases before'
         return f'waits for {self.joined.core.waiting_for()}'
 
     def settled(self, seconds: float) -> bool:

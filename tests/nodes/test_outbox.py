@@ -1,0 +1,43 @@
+"""What a node has published is kept for a while, for readers that lack some of it."""
+
+import pytest
+
+from codetr_ros.nodes.outbox import LABELS, Outbox
+from helpers.builders import step_rewards, transitions
+
+
+def labelled(outbox, phases):
+    for phase in phases:
+        outbox.keep(step_rewards(phase=phase))
+
+
+def test_labels_are_owed_until_a_reader_asks_for_those_of_a_later_phase():
+    outbox = Outbox(phase_steps=5, phases=3)
+    labelled(outbox, range(2))
+    assert not outbox.owes, 'there is room for one phase more'
+    labelled(outbox, [2])
+    assert outbox.owes
+    list(outbox.read(0, [LABELS]))
+    assert outbox.owes, 'the answer may be lost: the reader asks again'
+    list(outbox.read(1, [LABELS]))
+    assert not outbox.owes, 'phase 0 may go'
+    labelled(outbox, [3])
+    assert outbox.owes
+
+
+def test_a_reader_that_asks_for_labels_to_come_lacks_none_of_those_before():
+    outbox = Outbox(phase_steps=5, phases=3)
+    labelled(outbox, range(3))
+    with pytest.raises(KeyError, match='nothing of phase 9 is kept'):
+        outbox.read(9, [LABELS])
+    assert not outbox.owes
+
+
+def test_nobody_waits_for_readers_of_anything_but_labels():
+    outbox = Outbox(phase_steps=5, phases=1)
+    outbox.keep(transitions())
+    assert not outbox.owes
+    labelled(outbox, [1])
+    list(outbox.read(1))
+    list(outbox.read(1, [LABELS, 'codetr_msgs/msg/Metrics']))
+    assert outbox.owes, 'the recorder asks for all that was published'
