@@ -127,8 +127,10 @@ def test_a_matrix_that_rounding_has_made_indefinite_still_has_a_factor():
 # links
 
 
-def link(name: str) -> links.Link:
-    return links.make(name, BETA, 7)
+def link(name: str, ordinal: bool = False) -> links.Link:
+    made = links.make(name, BETA, 7)
+    made.ordinal = ordinal
+    return made
 
 
 def score(name: str, rewards: np.ndarray) -> float:
@@ -161,12 +163,13 @@ def test_the_level_is_the_constant_reward_that_explains_a_score(name):
     np.testing.assert_allclose(np.add.reduceat(slopes, STARTS), 1, rtol=1e-12)
 
 
+@pytest.mark.parametrize('ordinal', [False, True], ids=['numbers', 'verdicts'])
 @pytest.mark.parametrize('name', links.NAMES)
-def test_labels_explain_a_score_exactly_whatever_they_were_before(name):
+def test_labels_explain_a_score_exactly_whatever_they_were_before(name, ordinal):
     rng = np.random.default_rng(3)
     f, true = rng.normal(size=15), rng.normal(size=15)
     scores = np.array([score(name, part) for part in np.split(true, STARTS[1:])])
-    made = link(name)
+    made = link(name, ordinal)
     labels = f + np.repeat(made.shift(f, made.level(scores, M), STARTS, M), M)
     again = [score(name, part) for part in np.split(labels, STARTS[1:])]
     np.testing.assert_allclose(again, scores, rtol=1e-9, atol=1e-12)
@@ -174,9 +177,10 @@ def test_labels_explain_a_score_exactly_whatever_they_were_before(name):
     np.testing.assert_allclose(inside, 0, atol=1e-12)
 
 
+@pytest.mark.parametrize('ordinal', [False, True], ids=['numbers', 'verdicts'])
 @pytest.mark.parametrize('name', links.NAMES)
-def test_slopes_are_those_of_finite_differences(name):
-    made = link(name)
+def test_slopes_are_those_of_finite_differences(name, ordinal):
+    made = link(name, ordinal)
     f = np.random.default_rng(4).normal(2.0, 0.5, 15)  # far from the root's corner at 0
     slopes = made.forward(f, STARTS, M)[1]
     segment = np.repeat(np.arange(4), M)
@@ -187,11 +191,37 @@ def test_slopes_are_those_of_finite_differences(name):
         assert slopes[t] == pytest.approx(((up - down) / 2e-6)[segment[t]], rel=1e-5, abs=1e-8)
 
 
+@pytest.mark.parametrize('ordinal', [False, True], ids=['numbers', 'verdicts'])
 @pytest.mark.parametrize('name', links.NAMES)
-def test_the_slope_of_the_level_by_the_score_is_that_of_finite_differences(name):
-    made, scores = link(name), np.array([3.0, -2.0, 5.0, 1.5])
+def test_the_slope_of_the_level_by_the_score_is_that_of_finite_differences(name, ordinal):
+    made, scores = link(name, ordinal), np.array([3.0, -2.0, 5.0, 1.5])
     slope = (made.level(scores + 1e-6, M) - made.level(scores - 1e-6, M)) / 2e-6
     np.testing.assert_allclose(np.exp(made.log_slope(scores, M)), slope, rtol=1e-6)
+
+
+@pytest.mark.parametrize('name', links.NAMES)
+def test_where_scores_are_verdicts_levels_are_ordered_as_scores_however_long_segments_are(name):
+    made, rng = link(name, ordinal=True), np.random.default_rng(6)
+    true = rng.normal(size=15)
+    scores = np.array([score(name, part) for part in np.split(true, STARTS[1:])])
+    levels = made.level(scores, M)
+    assert np.argsort(levels).tolist() == np.argsort(scores).tolist()
+    np.testing.assert_allclose(made.score(levels, M), scores, rtol=1e-12)
+    if name != 'max_hard' and not name.startswith('peak'):  # those begin from another beta
+        np.testing.assert_allclose(made.forward(true, STARTS, M)[0], levels, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize('name', links.NAMES)
+def test_of_whole_segments_levels_of_verdicts_are_those_of_numbers_to_the_bit(name):
+    f, m = np.random.default_rng(7).normal(size=21), np.full(3, 7)
+    scores, starts = np.array([3.0, -2.0, 5.0]), np.array([0, 7, 14])
+    found = []
+    for ordinal in (False, True):
+        made = link(name, ordinal)
+        level = made.level(scores, m)
+        found.append([level, *made.forward(f, starts, m), made.shift(f, level, starts, m)])
+    for one, other in zip(*found, strict=True):
+        assert one.tobytes() == other.tobytes()
 
 
 @pytest.mark.parametrize('kind', [SoftMax, Minimum, PeakEnd])

@@ -203,6 +203,25 @@ def test_on_a_lopsided_scale_credit_is_better_than_with_stars_taken_for_numbers(
     assert np.mean(within['ordinal']) > np.mean(within['numbers']) + 0.02
 
 
+@pytest.mark.parametrize('kind', ['sum', 'square_sum', 'sum_square'])
+def test_a_robot_that_falls_soon_gets_no_better_steps_than_one_that_stands(kind):
+    edges = [composite(kind, np.ones(m), 3.0, 10) for m in (5, 7, 9)]
+    data = planted.memory(
+        lambda s, a, after: np.ones(len(a)),  # it stands: all steps are worth as much
+        lambda r: 1.0 + float(np.searchsorted(edges, composite(kind, r, 3.0, 10))),
+        irregular=True,
+        segments=120,
+    )
+    made = fitted(data, composite=kind)
+    ids = data.segments.all_ids()
+    lengths = data.segments.lengths(ids)
+    labels = np.concatenate(list(made.label_passes(data, ids)))
+    means = np.add.reduceat(labels, np.cumsum(lengths) - lengths) / lengths
+    short, long = (means[lengths == m].mean() for m in (5, 10))
+    assert short < 1.01 * long
+    assert np.corrcoef(made.predict(data.segments.batch(ids)), lengths)[0, 1] > 0.9
+
+
 def test_where_the_run_has_levels_scores_are_verdicts_unless_settings_state_otherwise():
     data = stars('sum', LOPSIDED, segments=40)
     auto = fitted(data, score_levels=5, **{'evidence.score_scale': 'auto'})

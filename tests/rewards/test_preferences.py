@@ -112,6 +112,35 @@ def test_what_is_preferred_gets_the_better_score_whichever_way_round_it_was_stat
     assert correlations(method, memory, rewards, worth)[1] > 0.7
 
 
+def test_of_two_segments_that_differ_in_length_alone_the_preferred_one_gets_the_better_score():
+    rng, lengths = np.random.default_rng(0), np.tile([3, 6, 8, 10], 10)
+    memory = Trajectories(OBSERVATION, ACTION, DELAY, 1000, 1000, cuts=Cuts(DELAY, 0))
+    for episode, steps in enumerate(lengths.tolist()):
+        memory.append(
+            builders.transitions(
+                sequence=episode, episode=episode, steps=steps, terminated=True,
+                observations=rng.normal(size=(steps + 1, OBSERVATION)).astype(np.float32),
+                actions=rng.uniform(-1, 1, (steps, ACTION)).astype(np.float32),
+            )
+        )  # fmt: skip
+    for _ in range(60):
+        first, second = rng.choice(len(lengths), 2, replace=False).tolist()
+        m, n = int(lengths[first]), int(lengths[second])
+        memory.judge(
+            Preference(
+                run_id='run', scorer='me', sequence=0,
+                source='sim', episode=first, first_step=0, length=m,
+                other_source='sim', other_episode=second, other_first_step=0, other_length=n,
+                outcome=0.5 + 0.5 * float(np.sign(m - n)),
+            )
+        )  # fmt: skip
+    memory.settle()
+    made = trained(memory, method='evidence', composite='sum', evidence__link='known')
+    batch = memory.segments.batch(memory.segments.all_ids())
+    assert np.corrcoef(made.predict(batch), batch.lengths)[0, 1] > 0.9
+    assert made.label(batch)[batch.lengths == DELAY].mean() > 0
+
+
 def test_a_later_preference_for_the_same_two_segments_replaces_the_former():
     memory = planted(0)[0]
     memory.judge(compared(3, 5, 1.0))

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from codetr_ros.records import EQUAL, F64, FIRST, I64, SECOND
+from codetr_ros.rewards.evidence.link import Link
 from codetr_ros.rewards.evidence.sample import Sample
 from codetr_ros.rewards.evidence.verdicts import Verdicts
 
@@ -36,18 +37,21 @@ class Duels:
     outcomes: F64  # (P,)
 
     @classmethod
-    def of(cls, sample: Sample, first: I64, second: I64, outcomes: F64) -> 'Duels':
+    def of(cls, sample: Sample, link: Link, first: I64, second: I64, outcomes: F64) -> 'Duels':
         """Between segments of a sample.
 
         Args:
             sample: holds them.
+            link: by what segments of different lengths are compared.
             first: (P,) the place of the first one.
             second: (P,) the place of the second one.
             outcomes: (P,) 1: the first is better, 0: the second, 0.5: both are as good.
         """
-        means = sample.means()
+        shares = link.shares(sample.m)
+        means = sample.means() * torch.tensor(shares)[:, None]
         rows = means[torch.tensor(first)] - means[torch.tensor(second)]
-        return cls(rows, torch.tensor(1 / sample.m[first] + 1 / sample.m[second]), outcomes)
+        spread = shares**2 / sample.m
+        return cls(rows, torch.tensor(spread[first] + spread[second]), outcomes)
 
     def before(self, deviation: float) -> tuple[F64, F64]:
         """Mean and variance (P,) of the differences while nothing is known of the segments.

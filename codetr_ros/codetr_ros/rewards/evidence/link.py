@@ -7,8 +7,13 @@ reward that would explain it, and F, the level of any step rewards. Levels and s
 units of the level scale throughout, except where a score is one. Steps lie one after the other,
 segment by segment; `starts` has where each of S segments begins, m (S,) how many steps it has.
 
+Where only the order of scores means anything, a short segment is judged as it is: the one of a
+robot that fell at once is poor, however good its few steps were on average. A sum is then
+compared with that of a whole segment, and its level is the sum divided by n, not by m. Where all
+segments are whole, that is the same.
+
 From the trial: levels, F and J = dF/dr of sum, square_sum and sum_square, and the floor of the
-last one's F. Decided here: the mean, and labels of sum_square by bisection.
+last one's F. Decided here: the mean, labels of sum_square by bisection, and levels of verdicts.
 """
 
 import math
@@ -36,6 +41,10 @@ class Link(ABC):
     name: ClassVar[str]
     linear: ClassVar[bool] = False
     """Whether F is linear in the step rewards."""
+    whole: int = 1
+    """n, the steps of a whole segment."""
+    ordinal: bool = False
+    """Only the order of scores means anything."""
 
     @abstractmethod
     def level(self, scores: F64, m: I64) -> F64:
@@ -52,6 +61,14 @@ class Link(ABC):
     @abstractmethod
     def forward(self, f: F64, starts: I64, m: I64) -> tuple[F64, F64]:
         """Levels F (S,) of step rewards f (N,), and J = dF/df (N,)."""
+
+    def shares(self, m: I64) -> F64:
+        """How much (S,) of the mean step reward is in what segments are compared by."""
+        return np.ones(len(m))
+
+    def _steps(self, m: I64) -> I64:
+        """The steps (S,) by which segments are compared: m, or n where only their order counts."""
+        return np.full_like(m, self.whole) if self.ordinal else m
 
     def measure(self, scale: float) -> None:
         """Take the level scale in, once it is known: temperatures are in units of it from here
@@ -89,68 +106,86 @@ class Mean(Link):
 
 
 class Sum(Mean):
-    """The sum S."""
+    """The sum S. In docstrings below, m stands for `_steps`."""
 
     name = 'sum'
 
+    def shares(self, m: I64) -> F64:
+        """m / n."""
+        shares: F64 = m / self.whole
+        return shares
+
     def level(self, scores: F64, m: I64) -> F64:
         """R / m."""
-        return scores / m
+        return scores / self._steps(m)
 
     def score(self, level: F64, m: I64) -> F64:
         """The level times m."""
-        return level * m
+        return level * self._steps(m)
 
     def log_slope(self, scores: F64, m: I64) -> F64:
         """-log m."""
-        return -np.log(m)
+        return -np.log(self._steps(m))
+
+    def forward(self, f: F64, starts: I64, m: I64) -> tuple[F64, F64]:
+        """The sum / m, and 1/m."""
+        steps = self._steps(m)
+        return np.add.reduceat(f, starts) / steps, np.repeat(1 / steps, m)
+
+    def shift(self, f: F64, level: F64, starts: I64, m: I64) -> F64:
+        """What is added (S,) to all steps of a segment so that they explain its level."""
+        shift: F64 = super().shift(f, level, starts, m) * (self._steps(m) / m)
+        return shift
 
 
-class SquareSum(Mean):
+class SquareSum(Sum):
     """|S| S: its signed root is a sum again."""
 
     name = 'square_sum'
 
     def level(self, scores: F64, m: I64) -> F64:
         """sign(R) sqrt(|R|) / m."""
-        return signed_power(scores, 0.5) / m
+        return signed_power(scores, 0.5) / self._steps(m)
 
     def score(self, level: F64, m: I64) -> F64:
         """|S| S of the sum S."""
-        return signed_power(level * m, 2)
+        return signed_power(level * self._steps(m), 2)
 
     def log_slope(self, scores: F64, m: I64) -> F64:
         """-log(2 m sqrt |R|)."""
-        return -np.log(2 * m * np.sqrt(_floored(scores)))
+        return -np.log(2 * self._steps(m) * np.sqrt(_floored(scores)))
 
 
-class SumSquare(Link):
+class SumSquare(Sum):
     """The sum of |r| r: its level is a signed root mean square."""
 
     name = 'sum_square'
+    linear = False
 
     def level(self, scores: F64, m: I64) -> F64:
         """sign(R) sqrt(|R| / m)."""
-        return signed_power(scores / m, 0.5)
+        return signed_power(scores / self._steps(m), 0.5)
 
     def score(self, level: F64, m: I64) -> F64:
         """The signed square times m."""
-        return m * signed_power(level, 2)
+        return self._steps(m) * signed_power(level, 2)
 
     def log_slope(self, scores: F64, m: I64) -> F64:
         """-log(2 sqrt(m |R|))."""
-        slopes: F64 = -np.log(2 * np.sqrt(m * _floored(scores)))
+        slopes: F64 = -np.log(2 * np.sqrt(self._steps(m) * _floored(scores)))
         return slopes
 
     def forward(self, f: F64, starts: I64, m: I64) -> tuple[F64, F64]:
         """The signed root of the mean of |f| f, and |f| / (m max(|F|, 0.05))."""
-        level = signed_power(np.add.reduceat(np.abs(f) * f, starts) / m, 0.5)
-        return level, np.abs(f) / np.repeat(m * np.maximum(np.abs(level), FLOOR), m)
+        steps = self._steps(m)
+        level = signed_power(np.add.reduceat(np.abs(f) * f, starts) / steps, 0.5)
+        return level, np.abs(f) / np.repeat(steps * np.maximum(np.abs(level), FLOOR), m)
 
     def shift(self, f: F64, level: F64, starts: I64, m: I64) -> F64:
         """The root of a function that only rises: between what lifts the largest and what lifts
         the smallest step to the level.
         """
+        level = level * np.sqrt(self._steps(m) / m)  # of the steps that there are
         low = level - np.maximum.reduceat(f, starts)
         high = level - np.minimum.reduceat(f, starts)
         due = signed_power(level, 2)

@@ -46,6 +46,7 @@ def make(name: str, beta: float, delay: int, ordinal: bool = False) -> Link:
         ordinal: only the order of scores means anything.
     """
     link = _MAKE[name](VERDICTS if ordinal else beta, delay)
+    link.whole = delay
     if ordinal and isinstance(link, SoftMax) and not isinstance(link, MaxLogSumExp):
         link.learnt = True
     return link

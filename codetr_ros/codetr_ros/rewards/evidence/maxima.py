@@ -168,15 +168,15 @@ class MaxLogSumExp(SoftMax):
 
     def level(self, scores: F64, m: I64) -> F64:
         """R - log(m) / beta."""
-        return scores - np.log(m) / self._raw_beta
+        return scores - np.log(self._steps(m)) / self._raw_beta
 
     def score(self, level: F64, m: I64) -> F64:
         """The level and log(m) / beta."""
-        return level + np.log(m) / self._raw_beta
+        return level + np.log(self._steps(m)) / self._raw_beta
 
     def forward(self, f: F64, starts: I64, m: I64) -> tuple[F64, F64]:
         """log(mean of exp(beta f)) / beta, and softmax(beta f)."""
         largest = np.maximum.reduceat(f, starts)
         raised = np.exp(self.beta * (f - np.repeat(largest, m)))
         total = np.add.reduceat(raised, starts)
-        return largest + np.log(total / m) / self.beta, raised / np.repeat(total, m)
+        return largest + np.log(total / self._steps(m)) / self.beta, raised / np.repeat(total, m)

@@ -135,7 +135,7 @@ class Evidence(Predictor):
             if choosing:
                 self._choose(sample, some, ordinal)
             else:
-                self._model.measure(scores, memory.segments.lengths(all_ids))
+                self._model.measure(scores, memory.segments.lengths(all_ids), ordinal)
                 self._model = self._fit(self._model, sample, some, anew, ordinal)
                 if self._second is not None:
                     self._second = self._fit(self._second, sample, some, anew, ordinal)

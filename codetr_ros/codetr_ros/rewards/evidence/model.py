@@ -94,16 +94,18 @@ class Model:
         self.verdicts: Verdicts | None = None
         """The scale of the scores, where it is ordinal."""
 
-    def measure(self, scores: F64, m: I64) -> None:
-        """Freeze the unit of levels, the first time.
+    def measure(self, scores: F64, m: I64, ordinal: bool) -> None:
+        """Note what scores are, and freeze the unit of levels, the first time.
 
         Args:
             scores: (S,) of segments.
             m: (S,) their steps.
+            ordinal: only the order of scores means anything.
 
         Raises:
             FloatingPointError: they are too large for float64.
         """
+        self.link.ordinal = ordinal
         if not self.scale and not len(scores):  # preferences alone: their levels have no unit
             self.scale = 1.0
         if not self.scale:
@@ -128,7 +130,7 @@ class Model:
         Raises:
             FloatingPointError: numbers are too large for float64.
         """
-        self.measure(sample.scores, sample.m)
+        self.measure(sample.scores, sample.m, ordinal)
         levels = self.link.level(sample.scores, sample.m) / self.scale
         if duels is not None:
             self._fit_duels(sample, levels, some, duels, ordinal)
@@ -161,9 +163,10 @@ class Model:
             if verdicts is not None:
                 targets = _sites(verdicts, scores, mean, variance)
             differences, left = duels.sites(apart, apart_variance, deviation)
+            own = self._linear(sample, targets)
             data = Linear(
-                torch.cat([sample.means(), duels.rows]) if count else duels.rows,
-                torch.cat([torch.tensor(1 / sample.m), duels.spread]),
+                torch.cat([own.rows, duels.rows]) if count else duels.rows,
+                torch.cat([own.spread, duels.spread]),
                 torch.tensor(np.concatenate([targets.levels, differences])),
                 noise=torch.cat([torch.as_tensor(targets.noise), torch.tensor(left)]),
             )
@@ -226,15 +229,19 @@ class Model:
         self.left_out_r2 = 1 - float(residuals @ residuals) / total if total > 0 else 0.0
 
     def _linear(self, sample: Sample, targets: 'Targets') -> Linear:
-        """The regression where F is the mean."""
+        """The regression where F is the mean, or as much of it as a segment is of a whole one."""
         levels, spread = torch.tensor(targets.levels), torch.tensor(1 / sample.m)
-        return Linear(sample.means(), spread, levels, noise=targets.noise)
+        rows = sample.means()
+        if self.link.ordinal:
+            shares = torch.tensor(self.link.shares(sample.m))
+            rows, spread = rows * shares[:, None], spread * shares**2
+        return Linear(rows, spread, levels, noise=targets.noise)
 
     def _predicted(self, sample: Sample) -> F64:
         """Levels (S,) that the posterior mean lets expect."""
         if self.link.linear:
             predicted: F64 = (sample.means() @ self.posterior.mean).numpy()
-            return predicted
+            return predicted * self.link.shares(sample.m) if self.link.ordinal else predicted
         f = of_steps(sample.steps(), self.posterior.mean)
         return self.link.forward(f, sample.starts, sample.m)[0]
 

@@ -53,9 +53,9 @@ def fit_pairs(
         sampler.forget()
     everything = sampler.sample(memory, seen, steps=False)
     at = [np.searchsorted(seen, each) for each in (ids, first, second)]
-    duels = Duels.of(everything, at[1], at[2], pairs.outcomes[newest])
+    duels = Duels.of(everything, model.link, at[1], at[2], pairs.outcomes[newest])
     rng = generator(settings.seed, 'evidence', 'scales', fits)
     some = np.sort(rng.permutation(len(ids))[: settings.evidence.scale_scores])
-    model.measure(memory.segments.scores(all_ids), memory.segments.lengths(all_ids))
+    model.measure(memory.segments.scores(all_ids), memory.segments.lengths(all_ids), ordinal)
     model.fit(everything.part(at[0]), some, ordinal, duels)
     return seen

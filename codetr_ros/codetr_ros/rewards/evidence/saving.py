@@ -82,6 +82,7 @@ def restored(
     count = int(state['verdict_values'])
     if not 0 <= count <= MOST_VALUES:
         raise ValueError(f'verdict_values = {count}: an ordinal scale has 2 to {MOST_VALUES}')
+    link.ordinal = count > 0
     if count:
         values, thresholds = state['verdict_scale'].numpy()
         model.verdicts = Verdicts(
