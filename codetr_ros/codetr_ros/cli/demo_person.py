@@ -28,9 +28,14 @@ SETTINGS: dict[str, Any] = {
     'evaluate_every': 2000,
     'requests': 8,
     'people.best': -3.0,
-    'people.late': 300,
+    'people.late': 0,
 }
-"""What differs from the preset `quick`."""
+"""What differs from the preset `quick`.
+
+The person answers while the learner is at work. With answers that come while the arm moves, it
+would be for the machine to decide which phase learns from them, and with few scores that is most
+of how the first phases end.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,8 +43,8 @@ class Arguments:
     """Let a simulated person teach an arm to reach a target.
 
     Starts all nodes of a run over topics, and a node in the place of a person, who is asked for
-    some segments in each phase, gives each one to five points, late and not always rightly, and
-    leaves some out. One page shows the run, and on another you may score beside it. It ends by
+    some segments in each phase, gives each one to five points, not always rightly, and leaves
+    some out. One page shows the run, and on another you may score beside it. It ends by
     itself after some minutes with a report. docs/people.md explains each part.
     """
 

@@ -111,7 +111,7 @@ class Sum(Mean):
     name = 'sum'
 
     def shares(self, m: I64) -> F64:
-        """m / n."""
+        """The share m / n."""
         shares: F64 = m / self.whole
         return shares
 
