@@ -6,7 +6,7 @@ import pytest
 
 from codetr_ros.bags.definitions import encode
 from codetr_ros.bags.errors import BagError
-from codetr_ros.bags.phases import Phases
+from codetr_ros.bags.phases import NAMED, Phases
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.reopening import reopen
 from codetr_ros.bags.verify import verify
@@ -100,6 +100,27 @@ def test_a_phase_is_read_from_a_file_that_was_made_whole(killed, tmp_path):
     found = [list(phases.read(phase)) for phase in range(3)]
     assert [messages[-1][0] for messages in found] == [Commit] * 3
     assert len({len(messages) for messages in found}) == 1
+
+
+def test_a_phase_is_read_from_the_file_of_a_killed_recorder_and_the_next(tmp_path):
+    """It was under way when the recorder was killed: the first file begins before it and has an
+    end by now.
+    """
+    folder, records = tmp_path / 'bag', a_run()
+    first, second, _ = (i for i, record in enumerate(records) if isinstance(record, Commit))
+    halfway = (first + second) // 2
+    writer = McapWriter(folder, own_topics(), chunk_bytes=1000)
+    write(writer, records[:halfway])
+    writer.flush()
+    phases = Phases()
+    written = reopen(folder, lambda raw: phases.note(Bag(folder).entry(raw).record, raw.place))
+    writer = McapWriter(folder, own_topics(), chunk_bytes=1000, written=written)
+    write(writer, records[halfway:], phases)
+    assert len(Bag(folder).files) == 2
+    found = [raw for _, raw in phases.read(1)]
+    assert found == [
+        raw_of(record) for record in records[first + 1 : second + 1] if isinstance(record, NAMED)
+    ]
 
 
 def test_a_closed_bag_is_gone_on_with_in_a_new_file(tmp_path):

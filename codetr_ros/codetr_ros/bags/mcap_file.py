@@ -76,6 +76,7 @@ class McapFile:
         self._ids: Counter[int] = Counter()
         self._indexed: Counter[int] | None = None  # messages of the last chunk, by channel
         self._faulty = self._borrowed = False
+        self._from_begin = True
 
     @property
     def library(self) -> str:
@@ -125,6 +126,7 @@ class McapFile:
     def _records(self, file: BinaryIO, start: int) -> Iterator[RawMessage]:
         size = file.seek(0, 2)
         file.seek(0)
+        self._from_begin = not start
         at = start or self._begin(file, size)
         if at == size > len(MAGIC):
             return  # the disk cannot read any of it
@@ -292,7 +294,8 @@ class McapFile:
             raise FaultError(f'a record of kind {opcode:#04x}, which does not belong here')
         record = parse_record(SUMMARY[Opcode(opcode)], content)
         if isinstance(record, mcap_records.Statistics):
-            if (stated := record.message_count) != (read := self._ids.total()):
+            stated, read = record.message_count, self._ids.total()
+            if self._from_begin and stated != read:
                 self._report(at, f'the file counts {stated} messages, {read} were read', 0)
         elif self._checks is not None and isinstance(record, mcap_records.ChunkIndex):
             self._compare(at, self._checks.chunk_index(record))
