@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from codetr_ros import cli
@@ -25,7 +26,7 @@ from codetr_ros.config import Settings
 from codetr_ros.pages.feed import Feed
 from codetr_ros.pages.server import Server
 from codetr_ros.pages.watching import RunSource, serve
-from codetr_ros.records import Commit, EpisodeResult, Metrics
+from codetr_ros.records import Commit, EpisodeResult, Metrics, TrueRewards
 from codetr_ros.records.fields import type_name
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.live import Live
@@ -121,6 +122,24 @@ def test_the_page_shows_what_comes_while_it_is_looked_at(run: Run, tab: Callable
         page.wait_for_selector('#failure:visible')
         assert page.inner_text('#failure') == 'the disk is <b>full</b>'
         assert page.locator('#failure b').count() == 0
+
+
+def test_true_rewards_have_an_axis_of_their_own_where_scores_have_a_unit_of_their_own(
+    tmp_path: Path, tab: Callable[..., Any]
+):
+    for name, changes in (('simulator', {}), ('person', {'scorer': 'person'})):
+        run = begin(tmp_path / name, SETTINGS.changed({'method': 'evidence', **changes}))
+        true = TrueRewards(
+            run_id='run', source='sim', sequence=0, phase=0, episode=0, first_step=0,
+            rewards=np.linspace(-9, 9, 5, dtype=np.float32),
+        )  # fmt: skip
+        run.take(transitions(truncated=True), score(), true, step_rewards())
+        with served(run.folder) as (server, _):
+            page = tab(server.url)
+            page.wait_for_selector('#rewards canvas')
+            label = page.get_attribute('#rewards', 'aria-label')
+            assert ('true (for you alone, right axis) 9' in label) == (name == 'person')
+            assert page.locator('#rewards .u-axis').count() == 2 + (name == 'person')
 
 
 def test_a_finished_run_and_a_copy_of_it_show_the_same(run: Run, tab, tmp_path: Path):

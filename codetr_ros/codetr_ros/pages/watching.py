@@ -228,6 +228,8 @@ def about(folder: Path, settings: Settings) -> dict[str, Any]:
         'delay': config.delay_in_words(settings.delay),
         'method': settings.method,
         'seed': settings.seed,
+        # else what was inferred can be drawn beside the true rewards, on one axis
+        'own_unit': settings.scored_elsewhere or settings.score_levels > 0,
         'preset': preset,
         'differences': [
             [name, _shown(there), _shown(here)]

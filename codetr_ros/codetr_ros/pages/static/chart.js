@@ -32,7 +32,10 @@ export class Chart {
     matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => this.rebuild());
   }
 
-  /** Show curves: for each a name, its steps, and its values (null where there is none). */
+  /**
+   * Show curves: for each a name, its steps, and its values (null where there is none). Those with
+   * `right` have an axis of their own.
+   */
   show(curves) {
     const known = curves.filter(({ steps }) => steps.length);
     this.empty.hidden = known.length > 0;
@@ -64,20 +67,23 @@ export class Chart {
       grid: { stroke: colour('line'), width: 1 },
       ticks: { stroke: colour('line'), width: 1 },
     };
+    const ticked = { ...axis, size: 62, values: (plot, ticks) => ticks.map(number) };
+    const right = this.curves.some((curve) => curve.right);
     const options = {
       width: this.width(),
       height: this.height,
       scales: { x: { time: false } },
       axes: [{ ...axis, label: this.xLabel, labelSize: 20, size: 34 },
-        { ...axis, size: 62, values: (plot, ticks) => ticks.map(number) }],
+        ticked, ...(right ? [{ ...ticked, scale: 'right', side: 1, grid: { show: false } }] : [])],
       series: [
         { label: this.xLabel, value: shown },
-        ...this.curves.map(({ name, points }, i) => ({
-          label: name,
+        ...this.curves.map((curve, i) => ({
+          label: curve.name,
+          scale: curve.right ? 'right' : 'y',
           stroke: COLOURS[i % COLOURS.length],
           width: 1.5,
           spanGaps: true,
-          points: { show: points ? true : undefined },
+          points: { show: curve.points ? true : undefined },
           value: shown,
         })),
       ],

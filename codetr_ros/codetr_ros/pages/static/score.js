@@ -2,7 +2,7 @@
 import { Chart } from './chart.js';
 import { at, follow, make, number, send, write } from './page.js';
 
-const KEYS = 'Keys: the points themselves, = same as before, x can\'t tell, s later, c compare.';
+const KEYS = '= same as before, x can\'t tell, s later, c compare.';
 const FRAME_MS = 100;
 const state = { scale: [1, 5], desk: null, later: [], shown: [], correcting: null, last: null,
   comparing: false, busy: false };
@@ -74,9 +74,23 @@ class Shown {
 const one = new Shown(at('one'), 'The segment');
 const two = new Shown(at('two'), 'The second');
 
+/** The points of the scale, and the key of each: the point itself or, where it has no key, its place. */
+function points() {
+  const [lowest, highest] = state.scale;
+  const all = Array.from({ length: Math.max(0, highest - lowest + 1) }, (_, i) => lowest + i);
+  const own = lowest >= 0 && highest <= 9;
+  return all.map((point, i) => ({ point, key: String(own ? point : i + 1), own }));
+}
+
+function keysOfPoints() {
+  const all = points();
+  if (!all.length) return '';
+  return all[0].own ? 'the points themselves, ' : `1 to ${all.length} for the points in their order, `;
+}
+
 /** The segments to judge now: one, or two to be compared. */
 function due() {
-  if (state.correcting) return [state.correcting];
+  if (state.correcting) return state.correcting;
   const waiting = state.desk ? state.desk.waiting : [];
   const now = waiting.filter((each) => !state.later.some((later) => same(each, later)));
   const rest = [...now, ...waiting.filter((each) => !now.includes(each))];
@@ -95,8 +109,8 @@ function render() {
   write(at('state'), desk.finished ? 'The run has ended: nothing more is learnt.' : `The run goes on without you; ${phase}.`);
   // what somebody looks at stays, though the run asks for others by now: else a click would be for
   // another segment than the one that was looked at
-  const kept = state.shown.length && !state.shown.some((each) => !same(each, state.correcting) && judged(each));
-  const wanted = state.comparing && !state.correcting ? 2 : 1;
+  const kept = state.shown.length && (state.correcting || !state.shown.some(judged));
+  const wanted = state.correcting ? state.correcting.length : 1 + state.comparing;
   if (!kept || state.shown.length !== wanted) state.shown = due();
   const comparing = state.shown.length === 2;
   const none = !state.shown.length || desk.finished || Boolean(desk.problem);
@@ -108,7 +122,7 @@ function render() {
   at('same').disabled = state.last === null;
   const what = state.correcting ? 'Corrected: ' : '';
   write(at('which'), none ? 'Nothing waits to be scored.' :
-    `${what}${state.shown.map(words).join(' | ')}. ${desk.waiting.length} wait. ${comparing ? '' : KEYS}`);
+    `${what}${state.shown.map(words).join(' | ')}. ${desk.waiting.length} wait. ${comparing ? '' : `Keys: ${keysOfPoints()}${KEYS}`}`);
   if (!none) one.show(state.shown[0]).catch(refuse);
   if (comparing) two.show(state.shown[1]).catch(refuse);
   renderProblems(desk);
@@ -136,8 +150,7 @@ function renderGiven() {
   const rows = [...state.desk.given].reverse().map((given) => {
     const correct = make('button', { text: 'Correct' });
     correct.addEventListener('click', () => {
-      state.correcting = given.segment;
-      state.comparing = false;
+      state.correcting = given.other ? [given.segment, given.other] : [given.segment];
       state.shown = [];
       render();
     });
@@ -145,14 +158,14 @@ function renderGiven() {
       make('td', { text: words(given.segment) + (given.other ? ` | ${words(given.other)}` : '') }),
       make('td', { text: stated(given) }),
       make('td', { text: given.phase === null ? 'waits' : `phase ${given.phase}` }),
-      make('td', { children: given.other ? [] : [correct] }),
+      make('td', { children: [correct] }),
     ];
     return make('tr', { children: cells });
   });
   at('given').replaceChildren(...rows);
 }
 
-const waits = (segment) => [...state.desk.waiting, state.correcting].some((each) => same(each, segment));
+const waits = (segment) => [...state.desk.waiting, ...(state.correcting ?? [])].some((each) => same(each, segment));
 
 function refuse(error) {
   write(at('refused'), error.message);
@@ -192,23 +205,21 @@ function later() {
 }
 
 function compare() {
-  state.comparing = !state.comparing && state.desk.waiting.length > 1;
+  state.comparing = state.shown.length < 2 && state.desk.waiting.length > 1;
   state.correcting = null;
   state.shown = [];
   render();
 }
 
 function renderScale() {
-  const [lowest, highest] = state.scale;
-  const any = highest < lowest;
+  const any = !points().length;
   at('number').hidden = !any;
   at('points').hidden = any;
-  const buttons = [];
-  for (let point = lowest; point <= highest; point += 1) {
-    const button = make('button', { text: String(point) });
+  const buttons = points().map(({ point, key, own }) => {
+    const button = make('button', { text: own ? String(point) : `${point} (${key})` });
     button.addEventListener('click', () => score(point));
-    buttons.push(button);
-  }
+    return button;
+  });
   at('points').replaceChildren(...buttons);
 }
 
@@ -244,10 +255,9 @@ document.addEventListener('keydown', (event) => {
     event.preventDefault();
     return;
   }
-  const [lowest, highest] = state.scale;
-  const point = Number(event.key);
-  if (!comparing && /^\d$/.test(event.key) && point >= lowest && point <= highest) {
-    score(point);
+  const pressed = points().find(({ key }) => key === event.key);
+  if (!comparing && pressed) {
+    score(pressed.point);
     event.preventDefault();
   }
 });

@@ -12,6 +12,7 @@ const actions = new Chart(at('actions'), 'Actions', { xLabel: 'step' });
 
 let columns = { points: {}, losses: {} };
 let episode = null;
+let ownUnit = false; // scores have a unit of their own, and so has what is inferred from them
 let connected = false;
 let ended = false;
 
@@ -42,6 +43,7 @@ function showRun(run) {
   write(at('title'), title);
   document.title = `${run.task} – codetr watch`;
   write(at('folder'), run.folder);
+  ownUnit = Boolean(run.own_unit);
   at('settings').replaceChildren(
     run.differences.length
       ? table(['setting', `preset ${run.preset}`, 'this run'], run.differences,
@@ -176,11 +178,14 @@ function showEpisode(shown) {
   const labelled = shown.inferred.some((value) => value !== null);
   const curves = [];
   if (labelled) {
-    const name = unit ? 'inferred' : 'inferred (in the unit of labels)';
+    const own = ownUnit ? 'inferred (in the unit of scores)' : 'inferred';
+    const name = unit ? own : 'inferred (in the unit of labels)';
     curves.push({ name, steps, values: unit ? scaled(shown.inferred) : shown.inferred });
   }
   if (shown.true.some((value) => value !== null)) {
-    curves.push({ name: 'true (for you alone)', steps, values: shown.true });
+    const right = labelled && ownUnit;
+    const name = right ? 'true (for you alone, right axis)' : 'true (for you alone)';
+    curves.push({ name, steps, values: shown.true, right });
   }
   rewards.show(curves);
   const all = (name, list) => list.map((values, i) => ({ name: `${name} ${i}`, steps, values }));
