@@ -122,9 +122,13 @@ def bad_scores(known: CompositeReward) -> list[Record]:
     ]
 
 
-def waits_for_permission(node: Presence) -> bool:
+BETWEEN_PHASES = {'sim': 'permission', 'record': 'permission', 'reward': 'the commit'}
+"""What nodes wait for while the learner permits no further phase."""
+
+
+def waits_for(what: str, node: Presence) -> bool:
     """Whether a node has waited for so long that it has taken all that was on its way."""
-    return 'permission' in node.doing and node.waiting > 2
+    return f'waits for {what}' in node.doing and node.waiting > 2
 
 
 @dataclass
@@ -152,8 +156,9 @@ def outcome(tmp_path_factory):
         # the simulator begins once it has found the evaluator, which may not have found it yet
         witness.until(lambda: 'everybody is there' in nodes.log('evaluate'))
         nodes.send(signal.SIGSTOP, 'learner')
-        for name in ('sim', 'record'):  # the phase is committed, and no lie can be of it
-            witness.until(lambda name=name: waits_for_permission(witness.presence[name]))
+        # the phase is committed, nobody is still at an earlier one, and no lie can be of it
+        for name, what in BETWEEN_PHASES.items():
+            witness.until(lambda n=name, what=what: waits_for(what, witness.presence[n]))
         nodes.send(signal.SIGSTOP, 'sim')  # it has said all of its phase, and begins none
         nodes.send(signal.SIGCONT, 'learner')
         witness.say(*bad_transitions())
