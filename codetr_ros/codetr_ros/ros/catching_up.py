@@ -167,7 +167,8 @@ class Fetcher:
             return
         for kind, data in answer.messages:
             self._take(kind, data)
-        if who == RECORDER:
+        # what the recorder has not committed yet, it has in part, and nothing follows from it
+        if who == RECORDER and any(kind is Commit for kind, _ in answer.messages):
             self._fetched(phase)
         if phase > self.behind or phase % 100 == 0:
             self._log.info(f'phase {phase}: {len(answer.messages)} messages came again')
