@@ -159,6 +159,32 @@ def test_labels_of_a_free_run_that_overtake_those_of_a_phase_before_come_early()
     assert not r.comes_early(second)
 
 
+def test_policies_that_overtake_those_of_phases_before_come_early_until_they_have_come():
+    r = recorder(overlap=True)
+    first, second = policy(phase=0), policy(phase=1)
+    assert r.comes_early(second) and not r.comes_early(first)
+    r.receive(first)
+    assert not r.comes_early(second) and r.still_due(second)
+    r.receive(second)
+    assert not r.still_due(second)
+
+
+def test_parts_of_labels_that_overtake_those_before_come_early_until_they_have_come():
+    r = recorder(warmup_steps=200)
+    work = r.work()
+    r.receive(policy())
+    r.receive(transitions(steps=200, phase_end=True, scores_due=0))
+    (made,) = commits(r, work)
+    first, second = (
+        step_rewards(phase=0, part=part, parts=2, commit=digest(made)) for part in range(2)
+    )
+    assert r.comes_early(second) and not r.comes_early(first)
+    r.receive(first)
+    assert not r.comes_early(second) and r.still_due(second)
+    r.receive(second)
+    assert not r.still_due(second)
+
+
 def test_a_free_robot_may_be_phases_ahead_of_the_permission_that_arrives():
     r = recorder(task='robot/arm', pace='free', evaluate_every=0)
     work = r.work()

@@ -8,8 +8,9 @@ import rclpy
 from codetr_msgs.srv import FetchPhase
 
 from codetr_ros.bags.definitions import decode
+from codetr_ros.nodes.asking import NEWEST
 from codetr_ros.nodes.outbox import Outbox
-from codetr_ros.ros.fetch import NEWEST, Asker, answer_signature
+from codetr_ros.ros.fetch import Asker, answer_signature
 from codetr_ros.ros.link import Link
 from codetr_ros.ros.resend import serve_outbox
 from helpers.builders import transitions

@@ -59,7 +59,7 @@ def test_a_killed_simulator_is_left_out_only_if_it_is_not_there_again_in_time(se
     assert ended.failures == []  # the weights are the undisturbed ones if nothing was dropped
     assert ended.errors == {}
     assert sum('sim_2       is killed' in line for line in ended.trace) == 1
-    assert sum('leaves sim_2 out' in line for line in ended.trace) == left_out
+    assert sum('sim_2 is left out' in line for line in ended.trace) == left_out
     again = next(i for i, line in enumerate(ended.trace) if 'is started again' in line)
     later = [line for line in ended.trace[again:] if ' sim_2 ' in line]
     assert any('publishes Transitions' in line for line in later)

@@ -10,10 +10,21 @@ import pytest
 
 from codetr_ros.bags import writer
 from codetr_ros.cores import announced, held, intake, learner, recorder
-from codetr_ros.nodes import fetching, patience, peers, settling, traffic
-from codetr_ros.nodes.last_phases import LastPhases
-from codetr_ros.records import TOPICS
+from codetr_ros.nodes import (
+    catching_up,
+    fetching,
+    patience,
+    peers,
+    settling,
+    sweeping,
+    traffic,
+)
+from codetr_ros.nodes.kept_run import KeptRun
+from codetr_ros.records import TOPICS, Policy, StepRewards
+from codetr_ros.simtest.disks import Trouble
+from codetr_ros.simtest.network import Weather
 from codetr_ros.simtest.plan import all_settings, plan
+from codetr_ros.simtest.process import Pace
 from codetr_ros.simtest.run import carry_out, undisturbed
 
 MOST = 150
@@ -37,6 +48,7 @@ def accept_gaps(patch):
         return True
 
     patch.setattr(recorder.Recorder, '_next', taken)
+    patch.setattr(recorder.Recorder, 'comes_early', lambda self, record: False)
 
 
 def count_nothing_twice(patch):
@@ -101,18 +113,18 @@ def leave_half_a_chunk(patch):
 
 
 def never_fetch_again(patch):
-    patch.setattr(fetching.Fetching, 'due', lambda self, missing, now: False)
+    patch.setattr(fetching.Fetching, 'due', lambda self, missing, now, at_once=False: False)
 
 
 def forget_the_last_phases(patch):
-    patch.setattr(LastPhases, 'hold', lambda self, record, raw: None)
+    patch.setattr(KeptRun, 'read', lambda self, phase, kinds=(): ())
 
 
 def count_strangers(patch):
-    def decode(self, kind, data):
+    def decode(self, kind, data, again=None):
         self.received[TOPICS[kind]] += 1
         self.run_id = 'nobody'  # so that the real one counts nothing
-        return real(self, kind, data)
+        return real(self, kind, data, again)
 
     real = traffic.Traffic.decode
     patch.setattr(traffic.Traffic, 'decode', decode)
@@ -181,6 +193,48 @@ def believe_strangers(patch):
         patch.setattr(module, 'check_run', lambda record, run: None)
 
 
+def never_ask(*names):
+    """Takes questions of a node out."""
+
+    def take_out(patch):
+        for name in names:
+            patch.setattr(catching_up.Fetcher, name, lambda self, *given: None)
+
+    return take_out
+
+
+def never_ask_for_announcements(patch):
+    never_ask('_ask_sources')(patch)
+
+
+def never_ask_for_commits(patch):
+    never_ask('_ask_commit')(patch)
+
+
+def never_ask_for_labels(patch):
+    never_ask('_ask_reward')(patch)
+
+
+def never_ask_for_policies(patch):
+    never_ask('_ask_learner')(patch)
+
+
+def never_sweep(patch):
+    patch.setattr(sweeping.Sweeper, 'ask', lambda self, nodes, lacking=False: None)
+
+
+def forget_early_ones_when_the_gap_before_them_is_filled(patch):
+    patch.setattr(recorder.Recorder, 'still_due', recorder.Recorder.comes_early)
+
+
+def keep_policies_and_labels_in_any_order(patch):
+    def place(self, record):
+        return None if isinstance(record, (Policy, StepRewards)) else real(self, record)
+
+    real = recorder.Recorder._place
+    patch.setattr(recorder.Recorder, '_place', place)
+
+
 MENDS: dict[Callable, str] = {
     accept_duplicates: 'other weights|not sound|are whole|gave up|stuck',
     accept_gaps: 'not sound|are whole|other weights',
@@ -195,7 +249,7 @@ MENDS: dict[Callable, str] = {
     never_fetch_again: 'gave up',
     forget_the_last_phases: 'gave up',
     count_strangers: 'were published on|not sound',
-    forget_who_has_ended: 'gave up|stuck',
+    forget_who_has_ended: 'gave up|stuck|stays for|were published on',
     commit_before_counting_the_phase: 'were published on|not sound|gave up',
     compare_no_digests: 'other weights|fault',
     judge_before_records_were_in_doubt: 'gave up',
@@ -204,15 +258,51 @@ MENDS: dict[Callable, str] = {
     end_before_all_is_there: 'were published on|names no cause|not sound',
     take_labels_again: 'repeated messages',
     believe_strangers: 'other weights|not sound|gave up|fault',
+    never_ask_for_announcements: 'gave up',
+    never_ask_for_commits: 'gave up',
+    never_ask_for_labels: 'gave up',
+    never_ask_for_policies: 'gave up',
+    never_sweep: 'gave up',
+    forget_early_ones_when_the_gap_before_them_is_filled: 'gave up',
+    keep_policies_and_labels_in_any_order: 'not sound',
 }
 
 
 def overrun(planned):
-    """The same run, but that some of what the recorder numbers never reaches it."""
-    return replace(planned, weather=replace(planned.weather, overrun=0.05), heals=False)
+    """The same run, but that some of what is published never reaches the recorder."""
+    return replace(planned, weather=replace(planned.weather, overrun=0.05))
 
 
-PLANS = {accept_gaps: overrun, wait_with_all_others: overrun}
+def unanswered(planned):
+    """The same run, but that some never reaches the recorder, and nobody answers."""
+    weather = replace(planned.weather, overrun=0.05, unanswered=1.0)
+    return replace(planned, weather=weather, heals=False)
+
+
+def lossy(planned):
+    """The same run, but that many messages are lost, and nothing else goes wrong."""
+    return replace(planned, weather=Weather(delay=0.02, lost=0.3, overrun=0.1), disk=Trouble())
+
+
+def drowsy(planned):
+    """The same run, but that all nodes look only now and then at what overtakes on its way."""
+    stalls = [(2.0 * i, 1.5) for i in range(60)]
+    paces = {name: Pace(stalls=stalls) for name in planned.paces}
+    return replace(planned, weather=Weather(delay=0.3, reorder=True), paces=paces, disk=Trouble())
+
+
+PLANS = {
+    forget_who_has_ended: drowsy,
+    accept_gaps: overrun,
+    wait_with_all_others: unanswered,
+    never_ask_for_announcements: lossy,
+    never_ask_for_commits: lossy,
+    never_ask_for_labels: lossy,
+    never_ask_for_policies: lossy,
+    never_sweep: lossy,
+    forget_early_ones_when_the_gap_before_them_is_filled: lossy,
+    keep_policies_and_labels_in_any_order: lossy,
+}
 """What is rare among the seeds is planned."""
 
 

@@ -4,7 +4,6 @@ Nothing is decoded, so nothing can change. Types that this library does not know
 definitions from their bag. The new bag is MCAP, whatever the old one was.
 """
 
-import os
 from collections import Counter
 from collections.abc import Iterable
 from contextlib import ExitStack
@@ -18,6 +17,7 @@ from codetr_ros.bags.definitions import text_of
 from codetr_ros.bags.metadata import METADATA, BagFile, render
 from codetr_ros.bags.raw import LIBRARY, Channel, RawMessage
 from codetr_ros.bags.writer import CHUNK_BYTES
+from codetr_ros.system.disk import Disk
 from codetr_ros.system.files import atomic_write, sync_folder
 from codetr_ros.system.parsing import ParseError, parse_yaml
 
@@ -68,12 +68,14 @@ class NewFile:
     Args:
         path: the file, which does not exist.
         library: the writer that it names.
+        disk: where it lies; None: the disk of this machine.
     """
 
-    def __init__(self, path: Path, library: str) -> None:
+    def __init__(self, path: Path, library: str, disk: Disk | None = None) -> None:
+        self._disk = disk or Disk()
         self.path = path
         self.about = BagFile(path.name)
-        self._file = path.open('xb')
+        self._file = self._disk.create(path)
         self._writer: Any = Writer(  # its methods carry no types
             self._file,
             chunk_size=CHUNK_BYTES,
@@ -115,8 +117,7 @@ class NewFile:
     def finish(self) -> None:
         """Write the index, and wait until all of it is on the disk."""
         self._writer.finish()
-        self._file.flush()
-        os.fsync(self._file.fileno())
+        self._disk.sync(self._file)
 
     def close(self) -> None:
         """Close the file, whole or not."""

@@ -7,7 +7,6 @@ killed meanwhile leaves the bag as it was. A fault before the last commit is no 
 recorder, and is refused: nodes have learnt from what lies there.
 """
 
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from codetr_ros.bags.writer import Written
 from codetr_ros.records import Commit
 from codetr_ros.records.fields import type_name
 from codetr_ros.records.names import full_name
+from codetr_ros.system.disk import Disk
 from codetr_ros.system.files import remedy, sync_folder
 
 PARTIAL = '.partial'
@@ -33,12 +33,15 @@ def holds_messages(folder: Path) -> bool:
     return folder.is_dir() and any(path.suffix == '.mcap' for path in folder.iterdir())
 
 
-def reopen(folder: Path, receive: Callable[[RawMessage], None]) -> Written:
+def reopen(
+    folder: Path, receive: Callable[[RawMessage], None], disk: Disk | None = None
+) -> Written:
     """Make all files of a bag whole and read them.
 
     Args:
         folder: the bag.
         receive: takes each message, in order.
+        disk: where it lies; None: the disk of this machine.
 
     Returns:
         What `McapWriter` needs to go on with the bag.
@@ -47,7 +50,7 @@ def reopen(folder: Path, receive: Callable[[RawMessage], None]) -> Written:
         BagError: the bag cannot be read, is damaged before its last commit, or cannot be written.
     """
     try:
-        mend(folder)
+        mend(folder, disk)
     except OSError as error:
         raise BagWriteError(
             f'bag {folder} cannot be made whole: {error.strerror}. {remedy(error).capitalize()}, '
@@ -67,7 +70,7 @@ def reopen(folder: Path, receive: Callable[[RawMessage], None]) -> Written:
     return written
 
 
-def mend(folder: Path) -> None:
+def mend(folder: Path, disk: Disk | None = None) -> None:
     """Give the last file of a bag its end if it lacks it, or remove it if it holds nothing.
 
     Raises:
@@ -85,22 +88,22 @@ def mend(folder: Path) -> None:
             path.unlink()
             continue
         if faults:
-            _write_anew(path)
+            _write_anew(path, disk or Disk())
         sync_folder(folder)
         return
 
 
-def _write_anew(path: Path) -> None:
+def _write_anew(path: Path, disk: Disk) -> None:
     """Replace a file by one of its sound messages, with an end."""
     partial = path.with_name(f'.{path.name}{PARTIAL}')
-    new = NewFile(partial, LIBRARY)
+    new = NewFile(partial, LIBRARY, disk)
     try:
         for message in _sound(path, []):
             new.add(message)
         new.finish()
     finally:
         new.close()
-    os.replace(partial, path)
+    disk.replace(partial, path)
 
 
 def _sound(path: Path, faults: list[Damage]) -> Iterator[RawMessage]:

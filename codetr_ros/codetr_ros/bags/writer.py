@@ -17,6 +17,7 @@ from collections import Counter
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,11 @@ CHUNK_BYTES = 64 * 1024
 yet flushed."""
 SPLIT_BYTES = 10**9
 """Size at which the next file is begun."""
+
+
+@cache
+def _qos_text(topic: BagTopic) -> str:
+    return yaml.safe_dump(topic.qos(), sort_keys=False)  # takes milliseconds
 
 
 @dataclass
@@ -144,7 +150,7 @@ class McapWriter:
                 'cdr',
                 schemas[topic.type],
                 {
-                    'offered_qos_profiles': yaml.safe_dump(topic.qos(), sort_keys=False),
+                    'offered_qos_profiles': _qos_text(topic),
                     'topic_type_hash': digest,
                 },
             )

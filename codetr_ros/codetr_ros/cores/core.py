@@ -38,7 +38,7 @@ class Core(Protocol[Given_co]):
 
     @property
     def unpermitted(self) -> int | None:
-        """The phase that it will run once it is permitted; None if there is none."""
+        """A phase whose policy is awaited; None if there is none."""
 
     @property
     def due(self) -> int | None:
@@ -111,7 +111,7 @@ class Part:
 
     @property
     def unpermitted(self) -> int | None:
-        """The phase that it will run once it is permitted; None if there is none."""
+        """A phase whose policy is awaited; None if there is none."""
         return None
 
     @property

@@ -87,6 +87,24 @@ class Evaluator(Part):
             self._seen.add(policy.version)
             self._waiting.append(('evaluation', policy.version, acting))
 
+    @property
+    def unpermitted(self) -> int | None:
+        """The phase whose policy has the next version to be evaluated; None if there is none."""
+        settings = self._settings
+        if self.finished:
+            return None
+        if settings.evaluate_every == 0:  # it waits for the end of the run
+            return settings.phases - 1 + settings.lag
+        if INITIAL_VERSION not in self._seen:
+            return 0
+        awaited = (
+            version
+            for version in range(settings.phases)
+            if settings.evaluated(version) and version not in self._seen
+        )
+        version = next(awaited, None)
+        return None if version is None else version + settings.lag
+
     def waiting_for(self) -> str:
         """What the next slice waits for, for people."""
         return 'a policy that is to be evaluated, from the learner'

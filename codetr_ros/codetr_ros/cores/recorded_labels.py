@@ -29,6 +29,11 @@ class RecordedLabels:
         """The first phase whose labels are not all there."""
 
     @property
+    def next(self) -> tuple[int, int]:
+        """Phase and part of the labels that come next."""
+        return self.due, min(self._lacks.get(self.due, ()), default=0)
+
+    @property
     def reduced(self) -> bool:
         """Whether the bag has less than was published."""
         return self._first is not None

@@ -78,6 +78,7 @@ class Recorder(Part):
         self._name = name
         self._tasks = Tasks(run, settings)
         self._permitted: dict[int, dict[str, int]] = {}
+        self._permission = 0  # the phase of the next policy
         self._chain = Chain(None if settings.free else settings.lag)
         self._labels = RecordedLabels(settings, self._chain)
         self._steps: Counter[tuple[int, str]] = Counter()  # (phase, source)
@@ -218,6 +219,7 @@ class Recorder(Part):
                 f'{policy.phase} already: stop the second learner'
             )
         self._chain.note(policy)
+        self._permission = max(self._permission, policy.phase + 1)
         steps = dict(zip(policy.sources, policy.steps.tolist(), strict=True))
         self._permitted[policy.phase] = {source: n for source, n in steps.items() if n}
 
@@ -259,19 +261,33 @@ class Recorder(Part):
                 )
 
     def comes_early(self, record: Record) -> bool:
-        """Whether records of the same source or scorer that must come before it have not come,
-        though it is no further ahead than what is permitted.
+        """Whether what must come before it has not come, though it is no further ahead than what
+        is permitted: records of the same source or scorer, policies or labels of phases before.
         """
+        place = self._place(record)
+        return place is not None and place[0] < place[1] < place[2]
+
+    def still_due(self, record: Record) -> bool:
+        """Whether a record that came early has neither come again nor been passed over."""
+        place = self._place(record)
+        return place is not None and place[0] <= place[1]
+
+    def _place(self, record: Record) -> tuple[Any, Any, Any] | None:
+        """The number that must come next, that of the record, and the first that is too far ahead;
+        None if they may come in any order.
+        """
+        settings = self._settings
         if isinstance(record, Transitions):
-            due = self._transitions[record.source]
-        elif isinstance(record, CompositeReward) and not self._settings.scored_elsewhere:
-            due = self._scores[record.scorer]
-        elif isinstance(record, StepRewards) and self._settings.free:
-            return record.phase > self._labels.due  # no commit waits for those before it
+            due, number = self._transitions[record.source], record.sequence
+        elif isinstance(record, CompositeReward) and not settings.scored_elsewhere:
+            due, number = self._scores[record.scorer], record.sequence
+        elif isinstance(record, Policy) and not settings.free:
+            return self._permission, record.phase, self._permission + settings.ahead + 1
+        elif isinstance(record, StepRewards):
+            return self._labels.next, (record.phase, record.part), (self.phase, 0)
         else:
-            return False
-        most = (self._settings.ahead + 1) * self._settings.phase_steps
-        return due < record.sequence < due + most
+            return None
+        return due, number, due + (settings.ahead + 1) * settings.phase_steps
 
     def _next(self, record: Any, due: 'Counter[str]', name: str) -> bool:
         if record.sequence > due[name]:

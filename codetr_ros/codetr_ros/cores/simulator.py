@@ -174,7 +174,7 @@ class Simulator(Part):
 
     @property
     def unpermitted(self) -> int | None:
-        """The phase that it will run once it is permitted; None if there is none."""
+        """The phase whose policy is awaited; None if it has come, or none is."""
         return self._phase if self.lacks_permission else None
 
     @property

@@ -13,13 +13,14 @@ from codetr_ros.bags.raw import RawMessage
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.reopening import holds_messages, reopen
 from codetr_ros.bags.topics import BagTopic
-from codetr_ros.bags.writer import McapWriter, Written
+from codetr_ros.bags.writer import CHUNK_BYTES, McapWriter, Written
 from codetr_ros.nodes.last_phases import LastPhases
 from codetr_ros.nodes.repeats import Repeats
 from codetr_ros.records import TOPICS, Commit, EpisodeResult, Record, RecordError, RunSpec
 from codetr_ros.records.fields import RECORD_TYPES, type_name
 from codetr_ros.records.identity import phase_of
 from codetr_ros.runs.reports import BagReport
+from codetr_ros.system.disk import Disk
 
 
 class KeptRun:
@@ -37,6 +38,8 @@ class KeptRun:
         phase_steps: environment steps of a phase.
         split_bytes: size at which the next file is begun; 0: never.
         keep_free: bytes that are to be left on the disk.
+        chunk_bytes: size at which a chunk of the bag is closed.
+        disk: where it lies; None: the disk of this machine.
     """
 
     def __init__(
@@ -47,6 +50,8 @@ class KeptRun:
         phase_steps: int,
         split_bytes: int = 0,
         keep_free: int = 0,
+        chunk_bytes: int = CHUNK_BYTES,
+        disk: Disk | None = None,
     ) -> None:
         self.folder = folder
         self.recorded: Counter[str] = Counter()
@@ -55,6 +60,8 @@ class KeptRun:
         self._topics = topics
         self._split_bytes = split_bytes
         self._keep_free = keep_free
+        self._chunk_bytes = chunk_bytes
+        self._disk = disk
         self._phase_steps = phase_steps
         self._writer: McapWriter | None = None
         self._phases = Phases()
@@ -78,13 +85,15 @@ class KeptRun:
             return
         written = Written()
         if holds_messages(self.folder) and _run_in(self.folder) in (run_id, None):
-            written = reopen(self.folder, lambda raw: self._restore(raw, restore))
+            written = reopen(self.folder, lambda raw: self._restore(raw, restore), self._disk)
         self._writer = McapWriter(
             self.folder,
             self._topics.values(),
+            self._chunk_bytes,
             split_bytes=self._split_bytes,
             keep_free=self._keep_free,
             written=written,
+            disk=self._disk,
         )
         self.gone_on = bool(written.files)
 

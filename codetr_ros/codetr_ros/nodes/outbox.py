@@ -2,10 +2,14 @@
 
 from collections.abc import Collection, Iterator
 
+from codetr_ros.config import Settings
 from codetr_ros.records import Presence, Record, RunSpec, StepRewards, TaskSpec
 from codetr_ros.records.fields import type_name
 from codetr_ros.records.identity import identity, phase_of
 
+KEPT_PHASES = 6
+"""Phases, beside those that may be under way, of which a node keeps what it has published: as far
+as a learner may go back whose newest checkpoints are damaged."""
 NOT_KEPT = (Presence, RunSpec)
 """Published again and again, or by other means."""
 LABELS = type_name(StepRewards)
@@ -31,6 +35,17 @@ class Outbox:
         self._announced: dict[object, TaskSpec] = {}
         self._phase = 0  # of the last record that named one
         self._asked = -1  # the newest phase of which a reader has asked for the labels alone
+
+    @classmethod
+    def of(cls, role: str, settings: Settings) -> 'Outbox':
+        """That of a role.
+
+        Args:
+            role: one of `records.ROLES`.
+            settings: those of the run.
+        """
+        phases = None if role == 'evaluate' else settings.ahead + KEPT_PHASES
+        return cls(settings.phase_steps, phases)
 
     @property
     def newest(self) -> int | None:

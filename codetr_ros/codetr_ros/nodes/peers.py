@@ -6,11 +6,11 @@ subscriptions cannot distinguish a recorder from `ros2 topic echo`. From then on
 """
 
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from codetr_ros.config import Settings
-from codetr_ros.records import Presence, roles
+from codetr_ros.records import TOPICS, Metrics, Presence, roles
 from codetr_ros.records.roles import TABLE
 from codetr_ros.system.liveness import has_ended
 
@@ -204,6 +204,17 @@ class Peers:
         for peer in self.by_instance.values():
             total.update(peer.published)
         return total
+
+    def published_to_us(self, own: Mapping[str, int]) -> 'Counter[str]':
+        """Counts of the records that were published for this node to receive, by topic.
+
+        Args:
+            own: counts of those that it has published itself.
+        """
+        published = self.published()
+        if self.role == 'record':  # it reads what it publishes, but for its commits
+            published[TOPICS[Metrics]] += own.get(TOPICS[Metrics], 0)
+        return published
 
 
 class Ledger:

@@ -16,36 +16,13 @@ from typing import Any
 import numpy as np
 from codetr_msgs.srv import FetchPhase
 
+from codetr_ros.nodes.asking import NEWEST, SERVICE, Answer, MakeAsks
 from codetr_ros.nodes.fetching import AGAIN
 from codetr_ros.nodes.signing import signature
 from codetr_ros.records import RecordError
 from codetr_ros.records.fields import RECORD_TYPES
 from codetr_ros.records.shown import shown
 from codetr_ros.ros.link import Link
-
-SERVICE = 'fetch_phase'
-"""That of the recorder."""
-NEWEST: int = FetchPhase.Request.NEWEST
-
-
-def service_of(node: str) -> str:
-    """The service of a node other than the recorder, by the node's full name."""
-    return f'{node}/{SERVICE}'
-
-
-@dataclass
-class Answer:
-    """What came of a question.
-
-    Attributes:
-        phase: which phase was sent; None if none was.
-        reason: why nothing was sent; empty if something was.
-        messages: kind and bytes of each.
-    """
-
-    phase: int | None
-    reason: str = ''
-    messages: list[tuple[type, bytes]] = field(default_factory=list)
 
 
 def answer_signature(key: bytes, service: str, request: Any, response: Any) -> bytes:
@@ -202,6 +179,16 @@ class Asker:
         self._asked_at = None
         phase = None if response.phase == NEWEST else response.phase
         question.answered(Answer(phase, '', question.messages))
+
+
+def askers(link: Link, run_id: str) -> MakeAsks:
+    """What makes that which asks a service, by the service's name.
+
+    Args:
+        link: the connection of who asks.
+        run_id: the run.
+    """
+    return lambda service: Asker(link, service, run_id)
 
 
 @dataclass

@@ -12,6 +12,7 @@ import numpy as np
 from codetr_ros.config import Settings, SettingsError, from_canonical
 from codetr_ros.cores.core import Core
 from codetr_ros.nodes.admission import Admission
+from codetr_ros.nodes.catching_up import Fetcher
 from codetr_ros.nodes.errors import NodeError, first_cause
 from codetr_ros.nodes.outbox import Outbox
 from codetr_ros.nodes.patience import Limit, Patience
@@ -19,9 +20,7 @@ from codetr_ros.nodes.peers import GAVE_UP, Peers
 from codetr_ros.nodes.traffic import Traffic
 from codetr_ros.records import (
     PROTOCOL_VERSION,
-    TOPICS,
     Commit,
-    Metrics,
     Presence,
     Record,
     RecordError,
@@ -31,16 +30,13 @@ from codetr_ros.records import (
 from codetr_ros.records.bounds import LONGEST_DOING
 from codetr_ros.records.roles import published_by
 from codetr_ros.ros import given, link, parameters
-from codetr_ros.ros.catching_up import Fetcher
+from codetr_ros.ros.fetch import askers
 from codetr_ros.ros.link import Link
 from codetr_ros.ros.own_parameters import core_parameters
 from codetr_ros.ros.resend import serve_outbox
 from codetr_ros.ros.signals import Stop
 from codetr_ros.system.files import FileError, check_makeable
 
-KEPT_PHASES = 6
-"""Phases, beside those that may be under way, of which a node keeps what it has published: as far
-as a learner may go back whose newest checkpoints are damaged."""
 PRESENCE_EVERY = 1.0  # [s] between two messages of presence and diagnostics
 
 
@@ -191,15 +187,15 @@ class Membership:
         self._serves = True
         if self.run is not None:
             self.traffic.run_id = self.run.run_id
-        if self.run is not None and (Commit in core.subscribes or self.role == 'sim'):
-            take = self.traffic.take_again
-            self._fetcher = Fetcher(self.link, self.run.run_id, self.peers, take)
+        if self.run is not None:
+            make, take = askers(self.link, self.run.run_id), self.traffic.take_again
+            phases = Commit in core.subscribes
+            self._fetcher = Fetcher(make, self.peers, take, self.log, phases)
 
     def keep_published(self, settings: Settings) -> None:
         """Keep what the node publishes from now on for a while, and send it again on request."""
         assert self.run is not None
-        phases = None if self.role == 'evaluate' else settings.ahead + KEPT_PHASES
-        self._outbox = Outbox(settings.phase_steps, phases)
+        self._outbox = Outbox.of(self.role, settings)
         serve_outbox(self.link, self.run.run_id, self._outbox)
 
     def publish(self, record: Record) -> None:
@@ -218,7 +214,7 @@ class Membership:
 
     def release(self) -> None:
         """Hand over what was held back while the node joined, and what comes from now on."""
-        self.traffic.release(self._fetched_later)
+        self.traffic.release(self._later)
 
     def begin_counting_anew(self) -> None:
         """Count as lost only what is published from now on and never arrives."""
@@ -227,12 +223,7 @@ class Membership:
 
     def all_published(self) -> 'Counter[str]':
         """Counts of the records that were published for this node to receive, by topic."""
-        published = self.peers.published()
-        if self.role == 'record':  # it reads what it publishes, but for its commits
-            published.update(
-                {t: n for t, n in self.link.published.items() if t == TOPICS[Metrics]}
-            )
-        return published
+        return self.peers.published_to_us(self.link.published)
 
     def turn(self, wait: float = 0.0) -> None:
         """Give ROS its turn: take what arrived, and publish the presence when it is due.
@@ -261,15 +252,12 @@ class Membership:
                 self._note_peer(record)
             elif isinstance(record, RunSpec):
                 self._note_run(record, data)
-            elif not self._fetched_later(record):
+            elif not self._later(record):
                 self.traffic.receive(record)
         except RecordError as error:
             self.traffic.refuse(kind, error)
 
-    def _fetched_later(self, record: Record) -> bool:
-        """Whether a record is of a phase that is fetched when those before it have been taken in:
-        the node has joined late, and could not hold all that comes meanwhile.
-        """
+    def _later(self, record: Record) -> bool:
         return self._fetcher is not None and self._fetcher.later(record, self.traffic.core)
 
     @property
@@ -277,15 +265,9 @@ class Membership:
         """Whether this node learns phases again, faster than the learner does, and would soon let
         go of labels that the learner lacks.
         """
-        if self._fetcher is None or self._outbox is None or not self._outbox.owes:
+        if self._fetcher is None or self._outbox is None:
             return False
-        due = self.traffic.core.due
-        learners = self.peers.alive('learner')
-        return (
-            due is not None
-            and due <= self._fetcher.behind
-            and any(not peer.presence.finished for peer in learners)
-        )
+        return self._fetcher.runs_away(self.traffic.core, self._outbox)
 
     # ---- runs and peers
 

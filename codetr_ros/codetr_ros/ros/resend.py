@@ -5,12 +5,12 @@ from collections.abc import Callable, Collection, Iterable
 import numpy as np
 from codetr_msgs.srv import FetchPhase
 
-from codetr_ros.bags.errors import BagError
+from codetr_ros.nodes.asking import NEWEST, SERVICE, Read, answer_to, service_of
 from codetr_ros.nodes.last_phases import LastPhases
 from codetr_ros.nodes.outbox import Outbox
 from codetr_ros.records.fields import type_name
 from codetr_ros.records.shown import shown
-from codetr_ros.ros.fetch import SERVICE, answer_signature, service_of
+from codetr_ros.ros.fetch import answer_signature
 from codetr_ros.ros.link import Link
 
 PART_BYTES = 4_000_000
@@ -18,10 +18,6 @@ PART_BYTES = 4_000_000
 
 MOST_REQUESTERS = 100
 """Nodes of which is remembered what they were sent."""
-
-Read = Callable[[int, Collection[str]], Iterable[tuple[type, bytes]]]
-"""Kind and bytes of each message of a phase that is of a wanted type, of any if none is named.
-A phase that is not held is a `KeyError`, whose message names those that are."""
 
 
 class PhaseService:
@@ -71,26 +67,18 @@ class PhaseService:
                 'the nodes of your run'
             )
             return response
-        phase = request.phase
-        if phase == FetchPhase.Request.NEWEST:
-            newest = self._newest()
-            if newest is None:
-                response.found, response.phase, response.parts = True, phase, 1
-                return response
-            phase = newest
-        try:
-            parts = _parts(self._read(phase, request.kinds))
-            part = parts[request.part]
-        except KeyError as error:
-            response.reason = str(error.args[0])
+        answer = answer_to(request.phase, request.kinds, self._read, self._newest, self._log)
+        if answer.reason:
+            response.reason = answer.reason
             return response
-        except IndexError:
+        phase, parts = answer.phase, _parts(answer.messages)
+        if phase is None:  # there is none, which is an answer
+            response.found, response.phase, response.parts = True, NEWEST, 1
+            return response
+        if request.part >= len(parts):
             response.reason = f'phase {phase} has {len(parts)} parts, not {request.part + 1}'
             return response
-        except (BagError, OSError) as error:
-            response.reason = f'phase {phase} cannot be read: {error}'
-            self._log.error(response.reason)
-            return response
+        part = parts[request.part]
         self._note(request.requester, phase)
         response.found, response.phase, response.parts = True, phase, len(parts)
         response.types = [type_name(kind) for kind, _ in part]

@@ -3,9 +3,10 @@
 from typing import TYPE_CHECKING, cast
 
 from codetr_ros.nodes.behind import Behind
+from codetr_ros.nodes.restoring import newest_committed, take_place
 from codetr_ros.ros.joining import Joined
 from codetr_ros.ros.membership import Membership
-from codetr_ros.ros.restoring import newest_committed, take_place
+from codetr_ros.ros.restoring import ask_recorder, returning
 from codetr_ros.ros.wiring import Wiring
 
 if TYPE_CHECKING:  # its imports take seconds, and follow once the run is known
@@ -24,8 +25,9 @@ class Simulating(Wiring):
         """What the simulator waits for, in words. If it was left out meanwhile, it goes on where
         the run stands.
         """
+        member, joined = self.member, self.joined
         if self._behind.asks:
-            newest_committed(self.member, self.joined, self._behind.answered)
+            ask_recorder(member, joined, newest_committed(self._behind.answered))
         if self._core.displaced:
-            take_place(self.member, self.joined)
+            ask_recorder(member, joined, take_place(returning(member, joined)))
         return super().waits()

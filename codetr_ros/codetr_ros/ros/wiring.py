@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from codetr_ros.nodes.restoring import go_on
 from codetr_ros.nodes.signing import VARIABLE
 from codetr_ros.records import TOPICS, Metrics
 from codetr_ros.records.roles import published_by
@@ -10,7 +11,7 @@ from codetr_ros.ros.course import Course
 from codetr_ros.ros.gathering import IDLE, absent_or_unmatched
 from codetr_ros.ros.joining import Joined
 from codetr_ros.ros.membership import Membership
-from codetr_ros.ros.restoring import go_on
+from codetr_ros.ros.restoring import ask_recorder, returning
 from codetr_ros.runs.reports import BagReport
 
 
@@ -66,7 +67,8 @@ class Wiring:
         """Let the core be as it was, if the run has begun without it or it was killed; false if
         asked to stop meanwhile.
         """
-        if not go_on(self.member, self.joined):
+        member, joined = self.member, self.joined
+        if not ask_recorder(member, joined, go_on(returning(member, joined))):
             return False
         self.member.release()
         return True

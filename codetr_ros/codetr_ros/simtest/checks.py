@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 COUNTED = tuple(TOPICS[kind] for kind in (Transitions, CompositeReward, StepRewards))
 """Topics of which every repeated message must be counted by a core that takes it."""
+NEWS = 15.0
+"""Seconds in which everybody knows that another node has ended."""
 OF_A_CUT = ('without its index: its writer was killed', 'have no true rewards')
 """What a bag may lack that was not closed. A commit does not wait for true rewards, from which
 nobody learns."""
@@ -44,6 +46,8 @@ def at_the_end(run: 'Simulated') -> list[str]:
     if gave_up and run.plan.heals:
         reasons = '; '.join(f'{p.name}: {p.error}' for p in gave_up)
         found.append(f'gave up, though nothing happened that the run cannot mend: {reasons}')
+    if run.plan.heals and not gave_up:
+        found += _late(run)
     found += _weights(run)
     found += _uncounted(processes)
     found += _bag(run, whole=not gave_up)
@@ -60,6 +64,17 @@ def _unexplained(processes: list[Process]) -> Iterator[str]:
             yield f'{each.name} fails by a fault: {type(each.error).__name__}: {each.error}'
         if not each.finished and each.error is None:
             yield f'{each.name} has ended and names no cause'
+
+
+def _late(run: 'Simulated') -> Iterator[str]:
+    """Nodes that stay though the recorder has ended, and nothing keeps the news from them."""
+    over = run.recording.ended_at
+    apart = sum(each.seconds for each in run.plan.weather.partitions)
+    for each in run.processes.values():
+        stalls = each.place.pace.stalls
+        held = sum(seconds for begin, seconds in stalls if begin + seconds > over > begin - NEWS)
+        if (seconds := each.ended_at - over) > apart + held + NEWS:
+            yield f'{each.name} stays for {seconds:.0f} s though the recorder has ended'
 
 
 def _weights(run: 'Simulated') -> Iterator[str]:
@@ -85,6 +100,7 @@ def _uncounted(processes: list[Process]) -> Iterator[str]:
         if each.error is not None:
             continue
         counted = Counter(each.core.duplicated) + each.traffic.refused + each.core.refused
+        counted += each.set_aside
         read = {TOPICS[kind] for kind in each.core.subscribes}
         for topic in COUNTED:
             if topic in read and each.repeated[topic] > counted[topic]:
@@ -104,7 +120,7 @@ def _unrecorded(run: 'Simulated') -> Iterator[str]:
         published += each.published
         if each.name in run.recording.without:
             excused += each.published
-    recorded = run.recording.recorded
+    recorded = run.recording.bag.recorded
     for topic, count in published.items():
         if not count - excused[topic] <= recorded[topic] <= count:
             yield f'{count} records were published on {topic}, the bag has {recorded[topic]}'

@@ -32,8 +32,11 @@ class _File(io.FileIO):
     def __init__(self, path: Path, trouble: Trouble) -> None:
         super().__init__(path, 'xb')
         self._trouble = trouble
+        self.abandoned = False  # its process was killed, with all that it had not handed over
 
     def write(self, data: bytes) -> int:  # type: ignore[override]
+        if self.abandoned:
+            return len(data)
         room = self._trouble.room
         if room is None:
             return super().write(data)
@@ -56,10 +59,13 @@ class TroubledDisk(Disk):
     trouble: Trouble = field(default_factory=Trouble)
     synced: dict[Path, int] = field(default_factory=dict)
     _paths: dict[int, Path] = field(default_factory=dict)
+    _files: list[_File] = field(default_factory=list)
 
     def create(self, path: Path) -> BinaryIO:
         """Open a new file."""
-        file = io.BufferedWriter(_File(path, self.trouble))  # type: ignore[type-var]
+        raw = _File(path, self.trouble)
+        self._files.append(raw)
+        file = io.BufferedWriter(raw)  # type: ignore[type-var]
         self.synced[path] = 0
         self._paths[id(file)] = path
         return file
@@ -72,6 +78,17 @@ class TroubledDisk(Disk):
                 raise OSError(errno.EIO, os.strerror(errno.EIO))
             self.trouble.syncs -= 1
         self.synced[self._paths[id(file)]] = file.tell()
+
+    def replace(self, old: Path, new: Path) -> None:
+        """Let a file take the place of another one."""
+        super().replace(old, new)
+        self.synced[new] = self.synced.pop(old)
+
+    def abandon(self) -> None:
+        """Lose what a process that was killed had not handed to the system."""
+        for file in self._files:
+            file.abandoned = True
+        self._files.clear()
 
     def free(self, folder: Path) -> int:
         """The bytes left."""

@@ -4,10 +4,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from codetr_ros.bags.definitions import decode, encode
+from codetr_ros.bags.topics import RECORDED
 from codetr_ros.records import CompositeReward, Presence, Record, Transitions
-from codetr_ros.simtest.network import FETCHED_AGAIN, Handle, Network, Weather
+from codetr_ros.simtest.network import FORGED, Handle, Network, Weather
 from codetr_ros.simtest.process import Packet, Process
-from codetr_ros.simtest.recording import RECORDED
 from codetr_ros.simtest.world import World
 
 STRANGER = 'stranger'
@@ -58,7 +58,7 @@ class Post:
             for each in self.processes.values()
             if self._reads(each, kind) and not (each is sender and ours)
         ]
-        if kind in FETCHED_AGAIN and self._world.rng.random() < self._weather.lies:
+        if kind in FORGED and self._world.rng.random() < self._weather.lies:
             lie = Packet(kind, self._world.number(), encode(forged(decode(kind, packet.data))))
             for reader in readers:
                 if reader != 'record':
@@ -68,6 +68,17 @@ class Post:
             strange = replace(decode(kind, packet.data), run_id=STRANGER)
             other = Packet(kind, self._world.number(), encode(strange))
             self.network.publish(STRANGER, readers, kind, lambda name: self._arrives(name, other))
+
+    def deliver_lasting(self, reader: Process) -> None:
+        """Send to a node that is started again what the others keep for late readers."""
+        for sender in self.processes.values():
+            if sender is reader or sender.ended:
+                continue
+            for kind, packets in sender.lasting.items():
+                for packet in packets if self._reads(reader, kind) else ():
+                    ordered = reader.role == 'record'
+                    handle = self._arrives(reader.name, packet)
+                    self.network.send(sender.name, reader.name, kind, handle, ordered)
 
     def send(self, sender: Process, reader: str, packet: Packet) -> None:
         """Send a request or an answer to one node."""

@@ -1,9 +1,11 @@
 """A network that delays, reorders, doubles and loses messages, and falls into parts.
 
-It promises what reliable DDS does, and no more. Messages of one publisher to one reader keep their
+It promises what reliable DDS does, and less. Messages of one publisher to one reader keep their
 order on a topic if the reader is the recorder, which counts on that; for others even that is
 broken. Topics that are transient local reach a reader after any partition. On other topics a
-partition that outlasts the lease of the middleware loses what was published meanwhile.
+partition that outlasts the lease of the middleware loses what was published meanwhile. Any other
+message of any kind may be lost too, on its way to any reader, and so may questions and answers.
+Messages come twice; to the recorder only where none is lost on the way there.
 """
 
 from collections import Counter
@@ -29,8 +31,10 @@ NUMBERED = (Transitions, CompositeReward, TrueRewards, StepRewards, Presence)
 """Kinds of which a recorder knows second copies."""
 KEPT_FOR_LATE = (RunSpec, TaskSpec, Policy, Commit)
 """What is published transient local (`ros/qos.py`)."""
-FETCHED_AGAIN = (Transitions, CompositeReward)
-"""What a consumer can fetch again from the recorder, so that it may be lost."""
+NEVER_LOST = (Presence, RunSpec)
+"""Published again and again, or known to every node here from the beginning."""
+FORGED = (Transitions, CompositeReward)
+"""Of which learner and reward node get false ones."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +59,9 @@ class Weather:
         delay: of a message, on average [s].
         reorder: whether messages overtake each other on the way to all but the recorder.
         doubled: share of messages that arrive twice.
-        lost: share of those messages that never arrive which a reader can fetch again.
-        overrun: share of those messages that never arrive at the recorder.
+        lost: share of messages, of every kind, that never arrive at any reader but the recorder.
+        overrun: share of messages, of every kind, that never arrive at the recorder.
+        unanswered: share of questions, and of answers, that never arrive.
         strangers: share of messages that arrive once more, as if they were of another run.
         lies: share of steps and scores of which learner and reward node get a forged copy first.
         partitions: when it falls into parts.
@@ -67,9 +72,15 @@ class Weather:
     doubled: float = 0.0
     lost: float = 0.0
     overrun: float = 0.0
+    unanswered: float = 0.0
     strangers: float = 0.0
     lies: float = 0.0
     partitions: tuple[Partition, ...] = ()
+
+    @property
+    def loses_for_the_recorder(self) -> bool:
+        """Whether messages may never arrive at the recorder."""
+        return bool(self.overrun) or any(each.seconds > LEASE for each in self.partitions)
 
 
 Handle = Callable[[], None]
@@ -107,7 +118,7 @@ class Network:
         world, weather = self._world, self._weather
         topic = TOPICS.get(kind, kind.__name__)
         begin = self._through(sender, reader, kind)
-        losing = (weather.overrun if ordered else weather.lost) if kind in FETCHED_AGAIN else 0.0
+        losing = self._losing(kind, ordered) if sender != reader else 0.0
         if begin is None or (losing and world.rng.random() < losing):
             self.lost[reader, topic] += 1
             world.note(sender, f'{topic} to {reader} is lost')
@@ -117,11 +128,21 @@ class Network:
             key = sender, reader, kind
             arrival = self._last[key] = max(arrival, self._last.get(key, 0.0))
         world.at(arrival, handle)
-        # copies of other kinds reach the bag
-        twice = kind in TOPICS and (kind in NUMBERED or not ordered)
+        # copies of other kinds reach the bag; and in the counts of a recorder, the copy of one
+        # message would make up for the loss of another
+        recorded = kind in NUMBERED and not weather.loses_for_the_recorder
+        twice = kind in TOPICS and (recorded or not ordered)
         if twice and world.rng.random() < weather.doubled:
             self.doubled[reader, topic] += 1
             world.at(arrival + world.rng.expovariate(1 / weather.delay), handle)
+
+    def _losing(self, kind: type, to_the_recorder: bool) -> float:
+        """The share of messages of a kind that never arrive."""
+        if kind not in TOPICS:
+            return self._weather.unanswered
+        if kind in NEVER_LOST:
+            return 0.0
+        return self._weather.overrun if to_the_recorder else self._weather.lost
 
     def _through(self, sender: str, reader: str, kind: type) -> float | None:
         """When a message gets through [s]; None: never."""

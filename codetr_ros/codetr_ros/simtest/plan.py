@@ -1,7 +1,7 @@
 """What happens in a simulated run: its settings and its troubles, all drawn from a seed."""
 
 import random
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
@@ -55,17 +55,19 @@ def all_settings() -> tuple[Settings, ...]:
 
 @dataclass(frozen=True)
 class Death:
-    """A simulator is killed, and started again.
+    """A node is killed, and started again.
 
     Attributes:
         name: of the node.
         at: when [s].
         seconds: until it is there again.
+        power: whether its machine loses its power, and so what is not synced to its disk.
     """
 
     name: str
     at: float
     seconds: float
+    power: bool = False
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,7 @@ class Plan:
         heals: whether the run must end as if nothing had happened; else it may also end by an
             error that names its cause.
         leave_out_after: seconds of silence after which a source is left out of a phase; 0: never.
-        deaths: simulators that are killed, and come back. Seeds draw none yet.
+        deaths: nodes that are killed, and come back.
     """
 
     seed: int
@@ -101,6 +103,7 @@ class Plan:
             weather.doubled
             or weather.lost
             or weather.overrun
+            or weather.unanswered
             or weather.strangers
             or weather.lies
             or weather.partitions
@@ -111,9 +114,13 @@ class Plan:
     @property
     def longest(self) -> float:
         """When even the longest wait must have ended [s]."""
+        return 20 * BUSY + 6 * DEADLINE + self.silent
+
+    @property
+    def silent(self) -> float:
+        """How long nodes stall or do not reach each other, all together [s]."""
         stalls = sum(length for pace in self.paces.values() for _, length in pace.stalls)
-        partitions = sum(each.seconds for each in self.weather.partitions)
-        return 20 * BUSY + 6 * DEADLINE + stalls + partitions
+        return stalls + sum(each.seconds for each in self.weather.partitions)
 
     def in_words(self) -> list[str]:
         """What is planned, for people."""
@@ -123,10 +130,12 @@ class Plan:
             f'overlap {settings.overlap}, delay {settings.delay}',
             f'messages take {weather.delay:g} s'
             f'{", overtake each other" if weather.reorder else ""}, {weather.doubled:.0%} arrive '
-            f'twice, {weather.lost:.0%} of what can be fetched again never',
+            f'twice, {weather.lost:.0%} never',
         ]
         if weather.overrun:
-            lines.append(f'{weather.overrun:.0%} of those never arrive at the recorder')
+            lines.append(f'{weather.overrun:.0%} never arrive at the recorder')
+        if weather.unanswered:
+            lines.append(f'{weather.unanswered:.0%} of questions and answers never arrive')
         if weather.strangers:
             lines.append(f'{weather.strangers:.0%} come once more as of another run')
         if weather.lies:
@@ -193,12 +202,13 @@ def plan(seed: int) -> Plan:
     silent += sum(length for pace in paces.values() for _, length in pace.stalls)
     heals = (
         disk == Trouble()
-        and not weather.overrun
         and all(each.seconds <= LEASE for each in partitions)
         and silent < DEADLINE / 2
     )
     # drawn last: what a seed drew before stays as it was
     leave_out_after = rng.choice((0.0, 3.0, 12.0)) if settings.simulators > 1 else 0.0
+    unanswered = rng.uniform(0.01, 0.1) if some.happens(0.3) else 0.0
+    weather = replace(weather, unanswered=unanswered)
     return Plan(seed, settings, weather, paces, disk, heals, leave_out_after)
 
 

@@ -4,25 +4,36 @@ A turn is that of `ros/node.py`: take what arrived, publish the presence when it
 what is missing, work one slice, publish what came out.
 """
 
-from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections import Counter, defaultdict, deque
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
 
 from codetr_ros.bags.definitions import encode
-from codetr_ros.config import Settings
+from codetr_ros.config import Settings, queues
 from codetr_ros.cores.core import Core
 from codetr_ros.cores.simulator import Simulator
+from codetr_ros.nodes.asking import SERVICE, Answer, answer_to
 from codetr_ros.nodes.behind import Behind
+from codetr_ros.nodes.catching_up import Fetcher
 from codetr_ros.nodes.errors import NodeError, first_cause
-from codetr_ros.nodes.fetching import Fetching
+from codetr_ros.nodes.outbox import Outbox
 from codetr_ros.nodes.patience import Limit, Patience
 from codetr_ros.nodes.peers import GAVE_UP, Peers
+from codetr_ros.nodes.restoring import (
+    Restoring,
+    Returning,
+    Steps,
+    go_on,
+    newest_committed,
+    take_place,
+)
 from codetr_ros.nodes.traffic import Traffic
 from codetr_ros.records import TOPICS, Commit, Presence, Record, RunSpec, describe
 from codetr_ros.records.roles import published_by
+from codetr_ros.simtest.asking import Asker, FetchAnswer, FetchRequest
 from codetr_ros.simtest.network import KEPT_FOR_LATE
 from codetr_ros.simtest.world import World
 
@@ -43,22 +54,6 @@ class Packet:
     kind: type
     number: int
     data: Any
-
-
-@dataclass(frozen=True)
-class FetchRequest:
-    """Asks the recorder for a phase."""
-
-    phase: int
-    requester: str
-
-
-@dataclass(frozen=True)
-class FetchAnswer:
-    """The messages of a phase, of which the recorder has all or none."""
-
-    phase: int
-    messages: Sequence[tuple[type, bytes]]
 
 
 class Mail(Protocol):
@@ -91,6 +86,33 @@ class Pace:
         return max(ends, default=None)
 
 
+@dataclass(frozen=True)
+class Place:
+    """Where a node is, and who it is.
+
+    Attributes:
+        world: the world.
+        mail: brings what it publishes.
+        run: the run.
+        settings: its settings.
+        role: one of `records.ROLES`.
+        name: its name.
+        pace: how quickly it works.
+        deadline: how long it waits for others [s].
+        instance: which start of the node this is: 1, 2, ...
+    """
+
+    world: World
+    mail: Mail
+    run: RunSpec
+    settings: Settings
+    role: str
+    name: str
+    pace: Pace
+    deadline: float
+    instance: int = 1
+
+
 class _Log:
     """Logs into the trace."""
 
@@ -108,86 +130,73 @@ class Process:
     """One node.
 
     Attributes:
+        place: where it is, and who it is.
         core: its core.
         error: why it gave up; None if it has not.
+        over: whether it has done everything, and stays for those that lack what it has published.
         ended: whether it has taken its last turn.
-        when_ended: called once it has.
-        newest_committed: returns the last committed phase, as its recorder answers.
-        when_displaced: called while it is permitted to go on after it was left out.
+        finished: whether its core was, when it ended.
+        ended_at: when that was [s].
         repeated: second copies that it has taken, by topic.
-        kept: what has arrived on topics that keep their messages for late readers.
+        set_aside: messages that are fetched again later instead, by topic.
+        lasting: packets that it has published on topics which keep them for late readers.
 
     Args:
-        world: where it is.
-        mail: brings what it publishes.
-        run: the run.
-        settings: its settings.
-        role: one of `records.ROLES`.
-        name: its name.
+        place: where it is, and who it is.
         core: its core.
-        pace: how quickly it works.
-        deadline: how long it waits for others [s].
-        instance: which start of the node this is: 1, 2, ...
     """
 
-    def __init__(
-        self,
-        world: World,
-        mail: Mail,
-        run: RunSpec,
-        settings: Settings,
-        role: str,
-        name: str,
-        core: Core[Record],
-        pace: Pace,
-        deadline: float,
-        instance: int = 1,
-    ) -> None:
-        self.instance = instance
-        self.role, self.name, self.core = role, name, core
+    def __init__(self, place: Place, core: Core[Record]) -> None:
+        self.place, self.core = place, core
+        self.world, self.mail, self.run = place.world, place.mail, place.run
+        self.role, self.name = place.role, place.name
         self.error: Exception | None = None
-        self.when_ended: Callable[[Process], None] = lambda process: None
-        self.newest_committed: Callable[[], int | None] = lambda: None
-        self.when_displaced: Callable[[Process], None] = lambda process: None
-        self.ended = False
-        self.finished = False  # the core was, when it ended
-        self.kept: list[Packet] = []
+        self.over = self.ended = self.finished = False
+        self.ended_at = 0.0
         self.repeated: Counter[str] = Counter()
+        self.set_aside: Counter[str] = Counter()
         self.published: Counter[str] = Counter()
+        self.lasting: defaultdict[type, deque[Packet]] = defaultdict(deque)
         self.doing = 'starting'
-        self.world = world
-        self.mail = mail
-        self.run = run
-        self.peers = Peers(role)
-        self.limit = Limit(deadline)
-        self.log = _Log(world, name)
-        self.traffic = Traffic(self.log, lambda: world.now)
+        self.peers = Peers(self.role)
+        self.limit = Limit(place.deadline)
+        self.log = _Log(self.world, self.name)
+        self.traffic = Traffic(self.log, self.now)
         self.traffic.core = core
-        self.traffic.settings, self.traffic.run_id = settings, run.run_id
-        self._settings = settings
-        self._pace = pace
+        self.traffic.settings, self.traffic.run_id = place.settings, place.run.run_id
         self._work = core.work()
         self._behind: Behind | None = None
         if isinstance(core, Simulator):
-            self._behind = Behind(self.traffic, core, settings)
+            self._behind = Behind(self.traffic, core, place.settings)
         self._patience = Patience(
-            f'/{name}',
+            f'/{self.name}',
             self.peers,
             [TOPICS[kind] for kind in core.subscribes],
             self.limit,
             self.log,
         )
-        self._fetching = Fetching() if Commit in core.subscribes else None
+        take, phases = self.traffic.take_again, Commit in core.subscribes
+        self._fetcher = Fetcher(self.make_asker, self.peers, take, self.log, phases, self.now)
+        self._outbox = Outbox.of(self.role, place.settings)
+        self._asked: dict[int, Asker] = {}  # by the numbers of their questions
+        self._restoring: Restoring | None = None
         self._inbox: deque[Packet] = deque()
         self._seen: set[int] = set()
         self._presence_at = -PRESENCE_EVERY
         self._waiting: float | None = None  # since when [s]
         self._begun = False
+        self._was_held = False
         self._turn_due = 0  # number of the turn that is to come
         self._idle = False
-        self._schedule(pace.begins)
+        if self.role != 'record':
+            self.traffic.hold()
+        self._schedule(place.pace.begins)
 
     # ---- time
+
+    def now(self) -> float:
+        """Virtual time [s]."""
+        return self.world.now
 
     def _schedule(self, time: float) -> None:
         self._turn_due += 1
@@ -197,8 +206,6 @@ class Process:
     def arrive(self, packet: Packet) -> None:
         """Take a message into the inbox; wakes the node if it waits."""
         self._inbox.append(packet)
-        if packet.kind in KEPT_FOR_LATE:
-            self.kept.append(packet)
         if self._idle and not self.ended:
             self._idle = False
             self._schedule(self.world.now)
@@ -206,9 +213,10 @@ class Process:
     def _turn(self, due: int) -> None:
         if self.ended or due != self._turn_due:
             return
-        until = self._pace.stalled_until(self.world.now)
+        until = self.place.pace.stalled_until(self.world.now)
         if until is not None:
             self._idle = False
+            self._was_held = True
             self.world.note(self.name, f'stalls for {until - self.world.now:.1f} s')
             self._schedule(until)
             return
@@ -228,94 +236,213 @@ class Process:
             self._take(self._inbox.popleft())
         if self.world.now - self._presence_at >= PRESENCE_EVERY:
             self.publish_presence()
-        if not self._begun and not self._gathered():
+        if self.over:
+            deadline = self.limit.seconds
+            if self.peers.waits_for_nobody('record', self.world.now, deadline):
+                self.end()
             return None
-        self._ask_again()
-        given = next(self._work)
+        if not (self._gathered() and self._restored()):
+            return None
+        if self._was_held:
+            self._was_held = False
+            self._waiting = None
+            self.held()
+        if self.pauses():
+            return None
+        runs_away = self._fetcher.runs_away(self.core, self._outbox)
+        if not runs_away:
+            self._fetcher.check(self.core)
+        given = None if runs_away else next(self._work)
         for record in given or ():
             self.deliver(record)
         if given is not None:
             self._waiting = None
-            return self.world.rng.expovariate(1 / self._pace.slice_seconds)
-        now = self.world.now
-        self._waiting = now if self._waiting is None else self._waiting
-        if self._behind is not None and self._behind.asks:
-            self._behind.answered(self.newest_committed())
-        if isinstance(self.core, Simulator) and self.core.displaced:
-            self.when_displaced(self)
-        elif self.core.finished:
-            self.doing = 'has finished'
-            if self.settled(now - self._waiting):
-                self.end()
-        else:
-            self.doing = f'waits for {self.core.waiting_for()}'
-            self._patience.check(now, now - self._waiting, self.doing, self.traffic.lost())
+            return self.world.rng.expovariate(1 / self.place.pace.slice_seconds)
+        self._wait()
         return None
 
+    def _wait(self) -> None:
+        now = self.world.now
+        self._waiting = now if self._waiting is None else self._waiting
+        if self.core.finished:
+            self.doing = 'has finished'
+            if self.settled(now - self._waiting):
+                self.leave()
+            return
+        self.doing = self.waits()
+        self._patience.check(now, now - self._waiting, self.doing, self.traffic.lost())
+
+    def waits(self) -> str:
+        """What the node waits for, in words. A simulator that was left out goes on where the run
+        stands.
+        """
+        if self._behind is not None and self._behind.asks:
+            self._restore(newest_committed(self._behind.answered))
+        elif isinstance(self.core, Simulator) and self.core.displaced:
+            self._restore(take_place(self._returning()))
+        return f'waits for {self.core.waiting_for()}'
+
+    def held(self) -> None:
+        """Note that the process was held, and has read nothing for a while."""
+
+    def pauses(self) -> bool:
+        """Whether the core must not work yet."""
+        return False
+
+    # ---- joining
+
     def _gathered(self) -> bool:
-        absent = self.peers.absent(self._settings, self.run.settings_hash)
-        if not absent:
-            self._begun = True
+        if self._begun:
             return True
-        doing, now = f'waits for {"; ".join(absent)}', self.world.now
-        if doing != self.doing:
+        if self._lacks(self.peers.absent(self.place.settings, self.run.settings_hash)):
+            return False
+        self._begun = True
+        self.go_on()
+        return True
+
+    def go_on(self) -> None:
+        """Let the core be as it was, if the run has begun without it or it was killed."""
+        self._restore(go_on(self._returning()))
+
+    def _returning(self) -> Returning:
+        return Returning(
+            role=self.role,
+            name=self.name,
+            core=self.core,
+            settings=self.place.settings,
+            peers=self.peers,
+            catch_up=self._catch_up,
+            begin_counting_anew=self.begin_counting_anew,
+            log=self.log,
+        )
+
+    def _catch_up(self, newest: int) -> None:
+        core: Any = self.core
+        core.catch_up(newest)
+        self._fetcher.behind = newest
+
+    def _restore(self, steps: Steps) -> None:
+        asker = self.make_asker(SERVICE)
+        self._restoring = Restoring(asker, self.traffic.fetched, f'/{self.name}', steps)
+
+    def _restored(self) -> bool:
+        """Whether all that was asked of the recorder has come."""
+        if self._restoring is not None:
+            if self._lacks(self._restoring.lacking()):
+                return False
+            self._restoring = None
+            self.traffic.release(self._later)
+        return True
+
+    def _lacks(self, lacking: list[str]) -> bool:
+        """Whether something is lacking; gives up if it is for too long."""
+        if not lacking:
+            self._waiting = None
+            return False
+        doing, now = f'waits for {"; ".join(lacking)}', self.world.now
+        if doing != self.doing or self._waiting is None:
             self.doing, self._waiting = doing, now
-        if self._waiting is not None and now - self._waiting > self.limit.seconds:
+        if now - self._waiting > self.limit.seconds:
             raise NodeError(
                 f'/{self.name} gave up after {self.limit.seconds:g} s: it {doing}',
                 self.peers.cause(),
             )
-        return False
+        return True
 
     # ---- messages
 
     def _take(self, packet: Packet) -> None:
-        if packet.kind in TOPICS:
+        if isinstance(packet.data, Presence):
+            self._note_peer(packet.data)
+        elif isinstance(packet.data, FetchAnswer):
+            asker = self._asked.pop(packet.data.number, None)
+            if asker is not None:
+                asker.arrived(packet.data)
+        elif isinstance(packet.data, FetchRequest):
+            self._answer(packet.data)
+        else:
             self.repeated[TOPICS[packet.kind]] += packet.number in self._seen
             self._seen.add(packet.number)
-        if isinstance(packet.data, Presence):
-            news = self.peers.note(packet.data, self.world.now)
-            if news:
-                self.world.note(self.name, news)
-            self.traffic.ledger.note(self.peers.published(), self.world.now)
-        elif isinstance(packet.data, FetchAnswer):
-            self.world.note(self.name, f'phase {packet.data.phase} came again')
-            for kind, raw in packet.data.messages:
-                self.traffic.take_again(kind, raw)
-            self.core.fetched(packet.data.phase)
-        else:
             self.take(packet.kind, packet.data)
+
+    def _note_peer(self, presence: Presence) -> None:
+        news = self.peers.note(presence, self.world.now)
+        if news:
+            self.world.note(self.name, news)
+            if self.peers.restarted(presence) and not presence.finished:
+                self.begin_counting_anew()
+        self.traffic.ledger.note(self.all_published(), self.world.now)
+
+    def all_published(self) -> 'Counter[str]':
+        """Counts of the records that were published for this node to receive, by topic."""
+        return self.peers.published_to_us(self.published)
+
+    def begin_counting_anew(self) -> None:
+        """Count as lost only what is published from now on and never arrives."""
+        traffic = self.traffic
+        traffic.ledger.forgive(self.all_published(), traffic.received + traffic.recovered)
 
     def take(self, kind: type, raw: bytes) -> None:
         """Take the bytes of a message."""
         record = self.traffic.decode(kind, raw)
-        if record is not None:
+        if record is None:
+            return
+        if not self._later(record):
             self.traffic.receive(record)
 
-    def _ask_again(self) -> None:
-        if self._fetching is None or not self._fetching.due(self.core.missing, self.world.now):
-            return
-        assert self.core.missing is not None
-        self.world.note(self.name, f'asks for phase {self.core.missing} again')
-        request = FetchRequest(self.core.missing, self.name)
-        self.mail.send(self, 'record', Packet(FetchRequest, 0, request))
+    def _later(self, record: Record) -> bool:
+        later = self._fetcher.later(record, self.core)
+        self.set_aside[TOPICS[type(record)]] += later
+        return later
+
+    def make_asker(self, service: str) -> Asker:
+        """What asks a service."""
+        return Asker(self, service)
+
+    def ask(self, asker: Asker, reader: str, request: FetchRequest) -> None:
+        """Send a question of an asker."""
+        self._asked[request.number] = asker
+        self.mail.send(self, reader, Packet(FetchRequest, 0, request))
+
+    def _answer(self, request: FetchRequest) -> None:
+        answer = FetchAnswer(request.number, self.answer(request))
+        self.mail.send(self, request.requester, Packet(FetchAnswer, 0, answer))
+
+    def answer(self, request: FetchRequest) -> Answer:
+        """What the node answers: it sends again what it has published."""
+
+        def read(phase: int, kinds: Any) -> list[tuple[type, bytes]]:
+            return [(type(r), self._encoded(r)) for r in self._outbox.read(phase, kinds)]
+
+        newest = partial(getattr, self._outbox, 'newest')
+        return answer_to(request.phase, request.kinds, read, newest, self.log)
+
+    def _encoded(self, record: Record) -> bytes:
+        return encode(record, round(self.world.now * 1e9))
 
     def deliver(self, record: Record) -> None:
         """Publish a record of the core."""
-        self.publish(record, encode(record, round(self.world.now * 1e9)))
+        self._outbox.keep(record)
+        self.publish(record, self._encoded(record))
 
     def publish(self, record: Record, raw: bytes) -> None:
         """Publish the bytes of a record."""
-        self.published[TOPICS[type(record)]] += 1
+        kind = type(record)
+        self.published[TOPICS[kind]] += 1
         self.world.note(self.name, f'publishes {describe(record)}')
-        self.mail.publish(self, Packet(type(record), self.world.number(), raw))
+        packet = Packet(kind, self.world.number(), raw)
+        if kind in KEPT_FOR_LATE:
+            self.lasting[kind].append(packet)
+            if len(self.lasting[kind]) > queues.depth(TOPICS[kind], self.place.settings):
+                self.lasting[kind].popleft()
+        self.mail.publish(self, packet)
 
     def publish_presence(self) -> None:
         """Publish the presence."""
         self._presence_at = self.world.now
         topics = tuple(t for t in published_by(self.role) if t in self.published)
-        doing, waiting = self.doing, 0.0
-        if self.ended:
+        doing, waiting, over = self.doing, 0.0, self.over or self.ended
+        if over:
             cause = self.error and first_cause(self.error, f'{self.role} /{self.name}')
             doing = f'{GAVE_UP}{cause}' if cause else 'has finished'
         elif self._waiting is not None:
@@ -324,9 +451,9 @@ class Process:
             run_id=self.run.run_id,
             role=self.role,
             node=f'/{self.name}',
-            instance_id=f'{self.name}#{self.instance}',
+            instance_id=f'{self.name}#{self.place.instance}',
             settings_hash='' if self.error else self.run.settings_hash,
-            finished=self.ended,
+            finished=over,
             topics=topics,
             published=np.array([self.published[t] for t in topics], np.uint64),
             missed=sum(self.traffic.lost().values()),
@@ -338,20 +465,33 @@ class Process:
     # ---- the end
 
     def die(self) -> None:
-        """End at once: nobody hears of it."""
+        """End at once: nobody hears of it, and nothing is saved."""
         self.ended = True
-        self.core.close()
         self.world.note(self.name, 'is killed')
 
     def settled(self, seconds: float) -> bool:
         """Whether the node may end, `seconds` after its core has finished."""
         return True
 
-    def end(self) -> None:
-        """Close the core and take leave."""
-        self.finished = self.core.finished and self.error is None
-        self.ended = True
-        self.world.note(self.name, 'has finished' if self.finished else f'fails: {self.error}')
+    def leave(self) -> None:
+        """Stay until the recorder has finished: it, or a node that is started again, may lack what
+        only this one can send.
+        """
+        self.over = True
         self.core.close()
         self.publish_presence()
-        self.when_ended(self)
+
+    def end(self) -> None:
+        """Close the core and take leave."""
+        self.close()
+        self.finished = self.core.finished and self.error is None
+        self.ended, self.ended_at = True, self.world.now
+        self.world.note(self.name, 'has finished' if self.finished else f'fails: {self.error}')
+        self.publish_presence()
+
+    def close(self) -> None:
+        """Save what must outlast the process."""
+        try:
+            self.core.close()
+        except Exception as error:  # noqa: BLE001 - judged by the simulation
+            self.error = self.error or error

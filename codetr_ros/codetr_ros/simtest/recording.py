@@ -1,144 +1,181 @@
-"""The recorder of a simulated run: the real core and the real bag, on a disk with troubles."""
+"""The recorder of a simulated run: the real core, the real bag on a disk with troubles, and what a
+real recorder decides.
+"""
 
-from collections import Counter
+from collections import deque
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
-from codetr_ros.bags.definitions import encode
-from codetr_ros.bags.topics import BagTopic
-from codetr_ros.bags.writer import McapWriter
-from codetr_ros.config import Settings
-from codetr_ros.cores.beside import Beside, Early
+from codetr_ros.bags.topics import RECORDED, topics_of_run
+from codetr_ros.cores.core import Core
 from codetr_ros.cores.recorder import Recorder
-from codetr_ros.nodes.last_phases import LastPhases
-from codetr_ros.nodes.repeats import Repeats
-from codetr_ros.nodes.settling import Settling, still_missing
-from codetr_ros.nodes.silence import Silence
-from codetr_ros.records import (
-    TOPICS,
-    Commit,
-    EpisodeResult,
-    Metrics,
-    Presence,
-    Record,
-    RunSpec,
-    TaskSpec,
-)
-from codetr_ros.records.fields import type_name
-from codetr_ros.records.roles import published_by
+from codetr_ros.nodes.asking import Answer, answer_to
+from codetr_ros.nodes.keeping import Keeper, Keeping
+from codetr_ros.nodes.kept_run import KeptRun
+from codetr_ros.records import TOPICS, Commit, Record, RunSpec
+from codetr_ros.simtest.asking import FetchRequest
 from codetr_ros.simtest.disks import TroubledDisk
-from codetr_ros.simtest.process import FetchAnswer, FetchRequest, Packet, Process
+from codetr_ros.simtest.process import Place, Process
 
-RECORDED = tuple(kind for kind in TOPICS if kind is not Presence)
 CHUNK_BYTES = 2048
 """So small that a phase has several chunks."""
 
 
+class _Bag(KeptRun):
+    """A bag that remembers what it was given.
+
+    Attributes:
+        history: kind and bytes of each message in it, in its order.
+    """
+
+    history: list[tuple[type, bytes]]
+
+    def write(
+        self, record: Record, data: bytes, log_time: int, published: int | None = None
+    ) -> None:
+        """Append a record."""
+        super().write(record, data, log_time, published)
+        self.history.append((type(record), data))
+
+
 class Recording(Process):
-    """The recorder: writes what arrives, and publishes a commit once it is on the disk."""
+    """The recorder: writes what arrives, and publishes a commit once it is on the disk.
+
+    Attributes:
+        disk: where its bag lies.
+        bag: what it keeps.
+
+    Args:
+        place: where it is.
+        core: its core.
+        folder: of the bag.
+        disk: where it lies.
+        leave_out_after: seconds of silence after which a source is left out; 0: never.
+    """
 
     def __init__(
         self,
-        *given: Any,
+        place: Place,
+        core: Core[Record],
         folder: Path,
         disk: TroubledDisk,
-        settings: Settings,
         leave_out_after: float,
     ) -> None:
-        super().__init__(*given)
+        super().__init__(place, core)
         self.disk = disk
-        self.recorded: Counter[str] = Counter()
-        self.history: list[tuple[type, bytes]] = []  # what the bag holds, in its order
-        self._silence = Silence(self.peers, settings, leave_out_after)
-        self._full = {kind: f'/run/{TOPICS[kind]}' for kind in RECORDED}
-        topics = [BagTopic(self._full[kind], type_name(kind), 16, False) for kind in RECORDED]
-        self._bag = McapWriter(folder, topics, CHUNK_BYTES, keep_free=0, disk=disk)
-        self._last = LastPhases(settings.ahead + 2)
-        core = cast(Recorder, self.core)
-        self._beside = Beside(self.run, settings, lambda: core.phase)
-        self._early = Early(settings)
-        self._repeats = Repeats()
-        self._settling = Settling(f'/{self.name}', self.peers, self.limit)
-        self._write(RunSpec, encode(self.run))
+        settings = place.settings
+        names = {kind: f'/run/{TOPICS[kind]}' for kind in RECORDED}
+        self.bag = _Bag(
+            folder,
+            dict(zip(RECORDED, topics_of_run(names, settings), strict=True)),
+            settings.ahead + 2,
+            settings.phase_steps,
+            chunk_bytes=CHUNK_BYTES,
+            disk=disk,
+        )
+        self.bag.history = []
+        # the newest commits are published again by a recorder that was started again
+        self._commits: deque[tuple[Commit, bytes]] = deque(maxlen=settings.ahead + 1)
+        self._keeping = Keeping(
+            Keeper(
+                who=f'/{self.name}',
+                run=place.run,
+                settings=settings,
+                core=cast(Recorder, core),
+                bag=self.bag,
+                traffic=self.traffic,
+                peers=self.peers,
+                limit=self.limit,
+                leave_out_after=leave_out_after,
+                make=self.make_asker,
+                published=self.all_published,
+                begin_counting_anew=self.begin_counting_anew,
+                log=self.log,
+                stamp=lambda: round(self.world.now * 1e9),
+                clock=self.now,
+            )
+        )
+        self.set_aside = self._keeping.early
 
-    def _write(self, kind: type, raw: bytes) -> None:
-        self._bag.write(self._full[kind], raw, round(self.world.now * 1e9))
-        self.recorded[TOPICS[kind]] += 1
-        self.history.append((kind, raw))
+    def open(self) -> None:
+        """Open the bag.
+
+        Raises:
+            BagError: it cannot be written.
+        """
+        self.bag.open(self.run.run_id, self._hold_already)
+        if not self.bag.recorded[TOPICS[RunSpec]]:
+            self._write(self.run, self._encoded(self.run))
+        for commit, raw in self._commits:
+            self.publish(commit, raw)
+
+    def _hold_already(self, record: Record, data: bytes) -> None:
+        self.bag.history.append((type(record), data))
+        if isinstance(record, Commit):
+            self._commits.append((record, data))
+        self._keeping.restore(record)
+
+    def _write(self, record: Record, raw: bytes) -> None:
+        self._keeping.write(record, raw)
 
     @property
     def without(self) -> list[str]:
         """Names of the nodes without which the run has ended."""
-        return [who.rpartition('/')[2] for who in self._settling.without]
+        return [who.rpartition('/')[2] for who in self._keeping.without]
+
+    def go_on(self) -> None:
+        """Ask all nodes for what was missed, if the bag was there before."""
+        self._keeping.go_on()
 
     def take(self, kind: type, raw: bytes) -> None:
         """Take the bytes of a message: what is admitted is written as it came."""
-        record = self.traffic.decode(kind, raw)
-        if record is not None:
-            self._admit(record, raw)
+        self._keeping.take(kind, raw)
 
-    def _admit(self, record: Record, raw: bytes) -> None:
-        if self._early.holds(record, raw):
-            return
-        beside = isinstance(record, (EpisodeResult, Metrics))
-        ours = record.run_id == self.run.run_id
-        if beside and ours and self._repeats.note(record):  # of a node that was started again
-            self.core.duplicated[TOPICS[type(record)]] += 1
-            return
-        learnt_from = type(record) in self.core.subscribes
-        if not self.traffic.receive(record, None if learnt_from else self._beside):
-            return
-        self._write(type(record), raw)
-        self._last.hold(record, raw)
-        if isinstance(record, TaskSpec):
-            for waiting, data in self._early.announced(record.source):
-                self._admit(waiting, data)
-
-    def _take(self, packet: Packet) -> None:
-        if isinstance(packet.data, FetchRequest):
-            self._answer(packet.data)
-        else:
-            super()._take(packet)
-
-    def _answer(self, request: FetchRequest) -> None:
-        try:
-            messages = self._last.get(request.phase)
-        except KeyError as error:
-            self.world.note(self.name, f'does not send again: {error.args[0]}')
-            return
-        answer = FetchAnswer(request.phase, messages)
-        self.mail.send(self, request.requester, Packet(FetchAnswer, 0, answer))
+    def answer(self, request: FetchRequest) -> Answer:
+        """What the recorder answers: it sends a phase again from the bag."""
+        newest = lambda: self.bag.newest  # noqa: E731
+        return answer_to(request.phase, request.kinds, self.bag.read, newest, self.log)
 
     def deliver(self, record: Record) -> None:
         """Publish a record of the core; a commit only after all that it names is on the disk."""
-        if not isinstance(record, Commit):
-            super().deliver(record)
-            return
-        raw = encode(record, round(self.world.now * 1e9))
-        self._write(Commit, raw)
-        self._bag.flush()
-        self._last.commit(record, raw)
+        raw = self._encoded(record)
+        if isinstance(record, Commit):
+            self._write(record, raw)
+            self.bag.flush()
         self.publish(record, raw)
 
-    def _do_turn(self) -> float | None:
-        silent = self._silence.sources(self.world.now)
-        for source in cast(Recorder, self.core).leave_out(silent):
-            self.world.note(self.name, f'leaves {source} out')
-        return super()._do_turn()
+    def held(self) -> None:
+        """Ask all nodes for what was published while nothing was read."""
+        self._keeping.held()
+
+    def pauses(self) -> bool:
+        """Whether what was missed is still being sent again."""
+        return self._keeping.catches_up()
+
+    def waits(self) -> str:
+        """What the recorder waits for, in words. What was lost on the way is asked for again, and
+        who is silent for too long is left out.
+        """
+        self._keeping.look_after()
+        return super().waits()
 
     def settled(self, seconds: float) -> bool:
         """Whether all nodes have finished and all their records are in the bag."""
-        ours = {t: n for t, n in self.published.items() if t in published_by(self.role)}
-        commits = {TOPICS[Commit]: self.recorded[TOPICS[Commit]]}
-        missing = still_missing(self.peers.published(), ours, self.traffic.received, commits)
-        self.traffic.lost_for_good = missing
-        settled, self.doing = self._settling.check(missing, seconds, self.world.now)
+        settled, self.doing = self._keeping.settled(seconds)
         return settled
 
-    def end(self) -> None:
-        """Finish the bag, then as all nodes."""
+    def leave(self) -> None:
+        """End: all others have."""
+        self.end()
+
+    def close(self) -> None:
+        """Finish the bag."""
         try:
-            self._bag.close()
+            self.bag.close()
         except Exception as error:  # noqa: BLE001 - judged by the simulation
             self.error = self.error or error
-        super().end()
+
+    def die(self) -> None:
+        """End at once: what was not handed to the system yet is lost."""
+        super().die()
+        self.disk.abandon()

@@ -7,11 +7,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import torch
 
 from codetr_ros.bags.definitions import decode
+from codetr_ros.bags.errors import BagError
 from codetr_ros.config import Settings
 from codetr_ros.cores import in_process
 from codetr_ros.cores.core import Core
@@ -21,14 +22,13 @@ from codetr_ros.cores.learner import Learner
 from codetr_ros.cores.recorder import Recorder
 from codetr_ros.cores.simulator import Simulator
 from codetr_ros.nodes import errors
-from codetr_ros.records import Commit, CompositeReward, Record, RunSpec
-from codetr_ros.records.dropped import undropped
+from codetr_ros.records import Commit, Record, RunSpec
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.simtest import checks
 from codetr_ros.simtest.disks import TroubledDisk
 from codetr_ros.simtest.mail import Post
 from codetr_ros.simtest.plan import DEADLINE, Death, Plan, names_of, plan
-from codetr_ros.simtest.process import Process
+from codetr_ros.simtest.process import Pace, Place, Process
 from codetr_ros.simtest.recording import Recording
 from codetr_ros.simtest.replay import replayed
 from codetr_ros.simtest.world import World
@@ -77,16 +77,26 @@ def undisturbed(canonical: str) -> Digests:
     )
 
 
-def core_of(role: str, name: str, run: RunSpec, settings: Settings) -> Core[Record]:
-    """The core of a node."""
+def core_of(
+    role: str, name: str, run: RunSpec, settings: Settings, checkpoints: Path | None
+) -> Core[Record]:
+    """The core of a node.
+
+    Args:
+        role: one of `records.ROLES`.
+        name: of the node.
+        run: the run.
+        settings: its settings.
+        checkpoints: where they go; None: nowhere.
+    """
     if role == 'sim':
         return Simulator(run, settings, name)
     if role == 'record':
         return Recorder(run, settings, name)
     if role == 'reward':
-        return Labeller(run, settings, name, None)
+        return Labeller(run, settings, name, checkpoints)
     if role == 'learner':
-        return Learner(run, settings, name, None)
+        return Learner(run, settings, name, checkpoints)
     return Evaluator(run, settings, name)
 
 
@@ -95,108 +105,69 @@ class Simulated:
 
     Args:
         planned: what will happen.
-        folder: an empty one, for the bag.
+        folder: an empty one, for the bag; checkpoints go beside it.
         kept: how many events the trace holds.
     """
 
     def __init__(self, planned: Plan, folder: Path, kept: int) -> None:
-        settings = planned.settings
         self.plan = planned
         self.folder = folder
         self.world = World(planned.seed, kept)
         self.disk = TroubledDisk(replace(planned.disk))
         self.post = Post(self.world, planned.weather)
-        run = settings.run_spec(RUN_ID)
-        self.processes: dict[str, Process] = {}
         self.failures: list[str] = []
-        for name, role in names_of(settings).items():
-            common = (
-                self.world, self.post, run, settings, role, name,
-                core_of(role, name, run, settings), planned.paces[name], DEADLINE,
-            )  # fmt: skip
-            try:
-                made = self._record(common) if role == 'record' else Process(*common)
-            except Exception as error:  # noqa: BLE001 - a disk that is full from the beginning
-                made = Process(*common)
-                made.error = error
-            made.newest_committed = self._newest_committed
-            made.when_displaced = self._take_place
-            self.processes[name] = made
+        self._run = planned.settings.run_spec(RUN_ID)
+        dying = {death.name for death in planned.deaths}
+        keeps = dying & {'reward', 'learner'}
+        self._checkpoints = folder.parent / run_folder.CHECKPOINTS if keeps else None
+        self.processes: dict[str, Process] = {}
         self.post.processes = self.processes
         self.post.watch = self._watch
-        for each in self.processes.values():
-            if each.error is not None:
-                each.end()
+        for name, role in names_of(planned.settings).items():
+            self._start(role, name, planned.paces[name])
         self._dead = 0  # processes that will be there again
         for death in planned.deaths:
             self.world.at(death.at, partial(self._kill, death))
 
+    def _start(self, role: str, name: str, pace: Pace, instance: int = 1) -> Process:
+        settings = self.plan.settings
+        place = Place(
+            self.world, self.post, self._run, settings, role, name, pace, DEADLINE, instance
+        )
+        core = core_of(role, name, self._run, settings, self._checkpoints)
+        made = self.processes[name] = (
+            Recording(place, core, self.folder, self.disk, self.plan.leave_out_after)
+            if role == 'record'
+            else Process(place, core)
+        )
+        if isinstance(made, Recording):
+            try:
+                made.open()
+            except BagError as error:  # a disk that is full from the beginning
+                made.error = error
+                made.end()
+        return made
+
     def _kill(self, death: Death) -> None:
         killed = self.processes[death.name]
-        # nodes that have ended here publish no presence any more, as real ones do for a while
-        under_way = cast(Recorder, self.recording.core).phase < self.plan.settings.phases
-        if under_way and not killed.ended:
-            killed.die()
-            self._dead += 1
-            again = partial(self._start_again, killed)
-            self.world.at(self.world.now + death.seconds, again)
+        if killed.ended or killed.over:
+            return
+        killed.die()
+        if death.power:
+            self.disk.lose_power(self.world.rng)
+        self._dead += 1
+        again = partial(self._start_again, killed)
+        self.world.at(self.world.now + death.seconds, again)
 
     def _start_again(self, killed: Process) -> None:
-        """Start a simulator that was killed: it goes on behind the last committed phase."""
+        """Start a node that was killed: it goes on where the run stands."""
         self._dead -= 1
-        settings, name = self.plan.settings, killed.name
-        core = Simulator(killed.run, settings, name)
-        committed = cast(Recorder, self.recording.core).phase
-        if committed:
-            for record in self._committed():
-                core.restore(record)
-            core.resume(committed)
-        pace = replace(self.plan.paces[name], begins=self.world.now)
-        made = Process(
-            self.world, self.post, killed.run, settings, 'sim', name, core, pace, DEADLINE,
-            killed.instance + 1,
-        )  # fmt: skip
-        made.newest_committed = self._newest_committed
-        made.when_displaced = self._take_place
-        self.processes[name] = made
-        for packet in killed.kept:
-            made.arrive(packet)
-        self.world.note(name, f'is started again, behind phase {committed - 1}')
-
-    def _committed(self) -> Iterator[Record]:
-        """The records of committed phases."""
-        there = [decode(kind, raw) for kind, raw in self.recording.history]
-        last = next(each for each in reversed(there) if isinstance(each, Commit))
-        scores = dict(zip(last.scorers, last.scores.tolist(), strict=True))
-        for record in undropped(there):
-            if isinstance(record, CompositeReward):
-                if record.sequence <= scores.get(record.scorer, -1):
-                    yield record
-            elif getattr(record, 'phase', -1) <= last.phase:
-                yield record
-
-    def _record(self, common: tuple[Any, ...]) -> Recording:
-        return Recording(
-            *common,
-            folder=self.folder,
-            disk=self.disk,
-            settings=self.plan.settings,
-            leave_out_after=self.plan.leave_out_after,
-        )
-
-    def _newest_committed(self) -> int | None:
-        phase = cast(Recorder, self.processes['record'].core).phase
-        return phase - 1 if phase else None
-
-    def _take_place(self, displaced: Process) -> None:
-        """Bring a simulator that was left out to where what was recorded of it ends."""
-        core = cast(Simulator, displaced.core)
-        committed = cast(Recorder, self.recording.core).phase
-        core.begin_anew()
-        for record in undropped(decode(kind, raw) for kind, raw in self.recording.history):
-            core.restore(record)
-        core.resume(max(committed, core.due))
-        self.world.note(displaced.name, f'goes on with phase {core.due}')
+        if self.recording.ended and not isinstance(killed, Recording) and not self._dead:
+            return
+        self.world.note(killed.name, 'is started again')
+        pace = replace(self.plan.paces[killed.name], begins=self.world.now)
+        made = self._start(killed.role, killed.name, pace, killed.place.instance + 1)
+        self.post.deliver_lasting(made)
 
     @property
     def recording(self) -> Recording:
@@ -207,10 +178,9 @@ class Simulated:
 
     def dropped(self) -> list[str]:
         """The sources that were left out, once for each phase."""
-        if not isinstance(self.processes['record'], Recording):
-            return []  # its disk was full from the beginning
-        there = (decode(kind, raw) for kind, raw in self.recording.history)
-        return [source for each in there if isinstance(each, Commit) for source in each.dropped]
+        commits = (raw for kind, raw in self.recording.bag.history if kind is Commit)
+        there = (cast(Commit, decode(Commit, raw)) for raw in commits)
+        return [source for each in there for source in each.dropped]
 
     def expected(self) -> Digests:
         """The weights that the run must end with: those of the undisturbed one or, where sources
@@ -219,7 +189,7 @@ class Simulated:
         settings = self.plan.settings
         if not self.dropped():
             return undisturbed(settings.canonical())
-        there = [decode(kind, raw) for kind, raw in self.recording.history]
+        there = [decode(kind, raw) for kind, raw in self.recording.bag.history]
         return Digests(*replayed(settings.run_spec(RUN_ID), settings, there))
 
     def _watch(self, kind: type, raw: bytes, reader: Process) -> None:
@@ -229,13 +199,11 @@ class Simulated:
 
     def run(self) -> Outcome:
         """Let it happen, and judge it."""
-        processes = self.processes.values()
         over = self.world.run(
             self.plan.longest,
-            lambda: bool(self.failures) or (not self._dead and all(p.ended for p in processes)),
+            lambda: bool(self.failures) or (not self._dead and self._all_ended()),
         )
-        for each in processes:
-            each.core.close()
+        processes = self.processes.values()
         if not over:
             waiting = [f'{p.name} {p.doing}' for p in processes if not p.ended]
             self.failures.append(
@@ -249,6 +217,9 @@ class Simulated:
         failures = [self._named(text) for text in self.failures]
         trace = [self._named(text) for text in self.world.trace()]
         return Outcome(self.plan, failures, gave_up, self.world.now, trace)
+
+    def _all_ended(self) -> bool:
+        return all(each.ended for each in self.processes.values())
 
     def _named(self, text: str) -> str:
         """A text without the name of the folder, which differs from run to run."""

@@ -26,6 +26,14 @@ class Disk:
         file.flush()
         os.fsync(file.fileno())
 
+    def replace(self, old: Path, new: Path) -> None:
+        """Let a file take the place of another one.
+
+        Raises:
+            OSError: it cannot.
+        """
+        os.replace(old, new)
+
     def free(self, folder: Path) -> int:
         """The bytes that are left on the disk of a folder.
 

@@ -4,10 +4,10 @@ was cut.
 
 import time
 from collections.abc import Callable, Iterable
+from typing import Any
 
+from codetr_ros.nodes.asking import NEWEST, Answer, Asks, MakeAsks, service_of
 from codetr_ros.nodes.fetching import AGAIN
-from codetr_ros.ros.fetch import NEWEST, Answer, Asker, service_of
-from codetr_ros.ros.link import Link
 
 UNNEWS = 3
 """Phases of a node with nothing new in them, after which it is not asked for earlier ones, unless
@@ -23,21 +23,27 @@ class Sweeper:
     it on in the order in which it was published.
 
     Args:
-        link: the recorder's connection.
-        run_id: the run.
+        make: makes what asks a node.
         known: returns whether a message came before.
         take: takes each message that comes.
+        log: the recorder's logger.
+        clock: monotonic time [s].
     """
 
     def __init__(
-        self, link: Link, run_id: str, known: Callable[[type, bytes], bool], take: TakeAgain
+        self,
+        make: MakeAsks,
+        known: Callable[[type, bytes], bool],
+        take: TakeAgain,
+        log: Any,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._link = link
-        self._log = link.node.get_logger()
-        self._run_id = run_id
+        self._make = make
         self._known = known
         self._take = take
-        self._askers: dict[str, Asker] = {}
+        self._log = log
+        self._clock = clock
+        self._askers: dict[str, Asks] = {}
         self._wanted: dict[str, float] = {}  # nodes to be asked, and when at the earliest
         self._asked: dict[str, float] = {}  # when each has answered last
         self._thorough: set[str] = set()  # nodes that are to be asked for all that they keep
@@ -71,11 +77,11 @@ class Sweeper:
                 return
             self._wanted[self._present] = 0.0  # it was killed meanwhile: ask it once more
             self._end()
-        now = time.monotonic()
+        now = self._clock()
         for node in [node for node, due in self._wanted.items() if due <= now]:
             asker = self._askers.get(node)
             if asker is None:
-                asker = self._askers[node] = Asker(self._link, service_of(node), self._run_id)
+                asker = self._askers[node] = self._make(service_of(node))
             if asker.ready:
                 del self._wanted[node]
                 self._present, self._phases, self._news = node, [], 0
@@ -101,7 +107,7 @@ class Sweeper:
         assert node is not None
         self._present, self._phases = None, []
         self._thorough.discard(node)
-        self._asked[node] = time.monotonic()
+        self._asked[node] = self._clock()
         sent = [message for messages in reversed(phases) for message in messages]
         if new := sum(self._take(kind, data) for kind, data in sent):
             self._log.warning(f'{new} messages of {node} had not arrived: it has sent them again')

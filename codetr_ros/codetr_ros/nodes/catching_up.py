@@ -1,5 +1,6 @@
-"""Fetches what a node lacks: committed phases from the recorder, labels from the reward node, what
-a source simulates from its simulator, permission for a phase from the learner.
+"""Decides what a node that lacks something asks of whom, and when: committed phases and commits of
+the recorder, labels of the reward node, policies of the learner, what a source simulates of its
+simulator.
 """
 
 import time
@@ -7,7 +8,9 @@ from collections.abc import Callable
 from typing import Any
 
 from codetr_ros.cores.core import Core
+from codetr_ros.nodes.asking import NEWEST, SERVICE, Answer, Asks, MakeAsks, service_of
 from codetr_ros.nodes.fetching import Fetching, Offered
+from codetr_ros.nodes.outbox import Outbox
 from codetr_ros.nodes.peers import Peers
 from codetr_ros.records import (
     TOPICS,
@@ -22,8 +25,6 @@ from codetr_ros.records import (
 )
 from codetr_ros.records.fields import type_name
 from codetr_ros.records.roles import WRITERS
-from codetr_ros.ros.fetch import NEWEST, SERVICE, Answer, Asker, service_of
-from codetr_ros.ros.link import Link
 
 OF_PHASES = (Transitions, CompositeReward, Preference, Commit)
 """Kinds of records that a commit names, and itself."""
@@ -35,31 +36,40 @@ TakeAgain = Callable[..., object]
 
 
 class Fetcher:
-    """Asks for what is awaited, and does not come.
+    """Asks for what a core has lacked for a while.
 
     Args:
-        link: the node's connection.
-        run_id: the run.
+        make: makes what asks a node.
         peers: the other nodes.
         take: takes each message that comes, as `Traffic.take_again` does.
+        log: the node's logger.
+        phases: whether its core takes phases in: the recorder is looked for at once then.
+        clock: monotonic time [s].
 
     Attributes:
         behind: phases up to this one were committed when the node joined: nothing of them is
             under way any more.
     """
 
-    def __init__(self, link: Link, run_id: str, peers: Peers, take: TakeAgain) -> None:
-        self._link = link
-        self._log = link.node.get_logger()
-        self._run_id = run_id
+    def __init__(
+        self,
+        make: MakeAsks,
+        peers: Peers,
+        take: TakeAgain,
+        log: Any,
+        phases: bool,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._make = make
         self._peers = peers
         self._take = take
-        self._recorder = Asker(link, SERVICE, run_id)
-        self._askers: dict[str, Asker] = {}  # of other nodes, by the names of their services
+        self._log = log
+        self._clock = clock
+        # by the names of their services
+        self._askers: dict[str, Asks] = {SERVICE: make(SERVICE)} if phases else {}
         self._phases, self._labels, self._commits = Fetching(), Fetching(), Fetching()
         self._tasks, self._permissions = Fetching(), Fetching()
-        self._permitted = Offered()
-        self._offered, self._committed = Offered(), Offered()
+        self._offered, self._committed, self._permitted = Offered(), Offered(), Offered()
         self._kinds: tuple[type, ...] = ()  # that the core takes in
         self._fetched: Callable[[int], None]  # lets the core know that a phase was sent again
         self.behind = -1
@@ -77,7 +87,7 @@ class Fetcher:
 
     def check(self, core: Core[Any]) -> None:
         """Ask for what the core has lacked for a while."""
-        now = time.monotonic()
+        now = self._clock()
         missing, unlabelled = core.missing, core.unlabelled
         if self._phases.due(missing, now, missing is not None and missing <= self.behind):
             assert missing is not None
@@ -97,6 +107,31 @@ class Fetcher:
         if self._labels.due(unlabelled, now, behind):
             assert unlabelled is not None
             self._ask_reward(unlabelled)
+
+    def runs_away(self, core: Core[Any], outbox: Outbox) -> bool:
+        """Whether this node learns phases again, faster than the learner does, and would soon let
+        go of labels that the learner lacks.
+
+        Args:
+            core: the node's.
+            outbox: what the node has published lately.
+        """
+        due = core.due
+        return (
+            outbox.owes
+            and due is not None
+            and due <= self.behind
+            and any(not peer.presence.finished for peer in self._peers.alive('learner'))
+        )
+
+    @property
+    def _recorder(self) -> Asks:
+        return self._asker(SERVICE)
+
+    def _asker(self, service: str) -> Asks:
+        if service not in self._askers:
+            self._askers[service] = self._make(service)
+        return self._askers[service]
 
     def _ask_recorder(self, phase: int) -> None:
         if not self._recorder.ready:
@@ -118,7 +153,7 @@ class Fetcher:
     def _offered_commit(self, phase: int, answer: Answer) -> None:
         if answer.reason or not answer.messages:
             return  # it has not committed the phase yet
-        if self._committed.lost(phase, time.monotonic()):
+        if self._committed.lost(phase, self._clock()):
             self._log.warning(f'the commit of phase {phase} was lost: it came again')
             for kind, data in answer.messages:
                 self._take(kind, data, lost=True)
@@ -140,25 +175,35 @@ class Fetcher:
             self._take(kind, data)
 
     def _ask_learner(self, phase: int) -> None:
-        """Ask for the policy that permits a phase: most often it is still to be learnt."""
+        """Ask for the policy that is waited for: if it was lost, none may follow that shows it."""
         for asker in self._nodes('learner')[:1]:
             kinds = [type_name(Policy)]
             asker.ask(phase, lambda answer: self._offered_policy(phase, answer), kinds)
 
     def _offered_policy(self, phase: int, answer: Answer) -> None:
-        if answer.messages and self._permitted.lost(phase, time.monotonic()):
-            self._log.warning(f'permission for phase {phase} had not arrived: it came again')
+        if answer.reason or not answer.messages:
+            self._ask_for_earlier(phase)  # it has not permitted the phase yet, or long ago
+        elif self._permitted.lost(phase, self._clock()):
+            self._log.warning(f'the policy of phase {phase} was lost: it came again')
             for kind, data in answer.messages:
                 self._take(kind, data)
 
-    def _nodes(self, role: str) -> list[Asker]:
+    def _ask_for_earlier(self, phase: int) -> None:
+        """Ask for a policy that the learner may keep no more."""
+        if self._recorder.ready:
+            kinds = [type_name(Policy)]
+            self._recorder.ask(phase, lambda answer: self._recorded_policy(phase, answer), kinds)
+
+    def _recorded_policy(self, phase: int, answer: Answer) -> None:
+        if not answer.reason:  # it is of a committed phase, and so was published long ago
+            for kind, data in answer.messages:
+                self._log.warning(f'the policy of phase {phase} was lost: it came again')
+                self._take(kind, data)
+
+    def _nodes(self, role: str) -> list[Asks]:
         """Those that ask the nodes of a role which are there and answer."""
-        askers = []
-        for peer in self._peers.alive(role):
-            service = service_of(peer.presence.node)
-            if service not in self._askers:
-                self._askers[service] = Asker(self._link, service, self._run_id)
-            askers.append(self._askers[service])
+        peers = self._peers.alive(role)
+        askers = [self._asker(service_of(peer.presence.node)) for peer in peers]
         return [asker for asker in askers if asker.ready]
 
     def _arrived(self, who: str, phase: int, answer: Answer) -> None:
@@ -176,5 +221,5 @@ class Fetcher:
     def _labelled(self, phase: int, answer: Answer) -> None:
         if answer.reason:
             return  # it has not labelled the phase yet
-        if phase <= self.behind or self._offered.lost(phase, time.monotonic()):
+        if phase <= self.behind or self._offered.lost(phase, self._clock()):
             self._arrived('the reward node', phase, answer)

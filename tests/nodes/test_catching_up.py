@@ -1,0 +1,129 @@
+"""A node asks for the policy that it waits for: the learner, or the recorder for an old one."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from codetr_ros.bags.definitions import encode
+from codetr_ros.cores.core import Part
+from codetr_ros.cores.evaluator import Evaluator
+from codetr_ros.cores.simulator import Simulator
+from codetr_ros.nodes.asking import SERVICE, Answer
+from codetr_ros.nodes.catching_up import Fetcher
+from codetr_ros.nodes.fetching import AFTER, AGAIN
+from codetr_ros.nodes.peers import Peers
+from codetr_ros.records import INITIAL_VERSION, Policy, Presence
+from helpers.builders import policy, tiny
+
+LEARNER = Presence(
+    run_id='run',
+    role='learner',
+    node='/learner',
+    instance_id='learner',
+    settings_hash='settings',
+    finished=False,
+    topics=(),
+    published=np.zeros(0, np.uint64),
+    missed=0,
+)
+
+
+class Waits(Part):
+    """A core that waits for the policy of a phase."""
+
+    subscribes = (Policy,)
+    unpermitted: int | None = 3
+
+
+@dataclass
+class Asked:
+    """A node that answers at once."""
+
+    service: str
+    answer: Answer
+    questions: list[int] = field(default_factory=list)
+    ready: bool = True
+    busy: bool = False
+
+    def ask(self, phase, answered, kinds=()):
+        assert kinds == ['codetr_msgs/msg/Policy']
+        self.questions.append(phase)
+        answered(self.answer)
+
+
+@pytest.fixture
+def fetcher():
+    """A fetcher, the nodes that it asks, what it takes, and its clock."""
+    asked = {
+        '/learner/fetch_phase': Asked('/learner/fetch_phase', Answer(None, 'it is not kept')),
+        SERVICE: Asked(SERVICE, Answer(None, 'it is not committed')),
+    }
+    taken, now, peers = [], [0.0], Peers('sim')
+    peers.note(LEARNER, 0.0)
+    made = Fetcher(
+        asked.__getitem__,
+        peers,
+        lambda kind, data: taken.append(kind),
+        Log(),
+        phases=False,
+        clock=lambda: now[0],
+    )
+    return made, asked, taken, now
+
+
+class Log:
+    def warning(self, message):
+        pass
+
+
+def sent():
+    return Answer(3, '', [(Policy, encode(policy(phase=3)))])
+
+
+def test_a_policy_that_stays_out_is_asked_of_the_learner_and_taken_if_it_was_lost(fetcher):
+    made, asked, taken, now = fetcher
+    learner = asked['/learner/fetch_phase']
+    learner.answer = sent()
+    for now[0], questions, policies in ((0.0, 0, 0), (AFTER, 1, 0), (AFTER + AGAIN, 2, 1)):
+        made.check(Waits())
+        assert (len(learner.questions), len(taken)) == (questions, policies)
+    assert asked[SERVICE].questions == []
+
+
+def test_a_policy_that_the_learner_keeps_no_more_is_asked_of_the_recorder(fetcher):
+    made, asked, taken, now = fetcher
+    asked[SERVICE].answer = sent()
+    for now[0] in (0.0, AFTER):
+        made.check(Waits())
+    assert asked[SERVICE].questions == [3]
+    assert taken == [Policy]
+
+
+def test_nobody_is_asked_by_a_core_that_waits_for_no_policy(fetcher):
+    made, asked, _, now = fetcher
+    core = Waits()
+    core.unpermitted = None
+    for now[0] in (0.0, AFTER, AFTER + AGAIN):
+        made.check(core)
+    assert not any(each.questions for each in asked.values())
+
+
+def test_a_simulator_waits_for_the_next_phase_until_its_policy_has_come():
+    settings = tiny()
+    core = Simulator(settings.run_spec('run'), settings, 'sim')
+    assert core.unpermitted == 0
+    core.receive(policy(sources=('sim',)))
+    assert core.unpermitted is None
+    core.close()
+
+
+def test_an_evaluator_waits_for_the_policy_with_the_next_version_to_be_evaluated():
+    settings = tiny()
+    core = Evaluator(settings.run_spec('run'), settings, 'evaluate')
+    due = [INITIAL_VERSION, *(v for v in range(settings.phases) if settings.evaluated(v))]
+    phases = [0, *(version + settings.lag for version in due[1:])]
+    assert core.unpermitted == phases[0]
+    core.receive(policy(phase=0, random=True, network='', weights=b''))
+    assert core.unpermitted == phases[1]
+    core.close()
