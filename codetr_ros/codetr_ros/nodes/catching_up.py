@@ -184,7 +184,7 @@ class Fetcher:
         if answer.reason or not answer.messages:
             self._ask_for_earlier(phase)  # it has not permitted the phase yet, or long ago
         elif self._permitted.lost(phase, self._clock()):
-            self._log.warning(f'the policy of phase {phase} was lost: it came again')
+            self._log.warning(f'permission for phase {phase} had not arrived: it came again')
             for kind, data in answer.messages:
                 self._take(kind, data)
 
@@ -197,7 +197,7 @@ class Fetcher:
     def _recorded_policy(self, phase: int, answer: Answer) -> None:
         if not answer.reason:  # it is of a committed phase, and so was published long ago
             for kind, data in answer.messages:
-                self._log.warning(f'the policy of phase {phase} was lost: it came again')
+                self._log.warning(f'permission for phase {phase} had not arrived: it came again')
                 self._take(kind, data)
 
     def _nodes(self, role: str) -> list[Asks]:
