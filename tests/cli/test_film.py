@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import imageio_ffmpeg
 import matplotlib.image
 import numpy as np
 import pytest
@@ -89,11 +90,16 @@ def test_a_film_shows_the_episodes_of_the_runs_own_evaluations(
         f'random policy {random.length} steps, after 200 steps {middle.length} steps, '
         f'after 400 steps {last.length} steps'
     )
-    assert f'It lasted: {lengths}. Drawing it took ' in note
+    assert f'It lasted: {lengths}. The video has the first 3 s of each' in note
     assert note.endswith(' s.'), note
     image = matplotlib.image.imread(io.BytesIO((run_dir / 'film.png').read_bytes()))
     height, width, _ = image.shape
     assert width == 960
+    frames = imageio_ffmpeg.read_frames(run_dir / 'film.mp4')
+    assert next(frames)['size'] == (3 * film.WIDTH, film.HEIGHT)
+    longest = max(random.length, middle.length, last.length)
+    assert sum(1 for _ in frames) == longest + 1  # 25 steps a second: none is left out
+    assert not list(run_dir.glob('.*'))
     # all rows have frames, which are not of one colour
     for row in np.split(image[: height // 3 * 3], 3):
         assert np.std(row[..., :3], axis=(0, 1)).min() > 0.05
@@ -210,6 +216,8 @@ def test_train_and_report_put_the_film_into_the_report(
     page = (folder / 'report.html').read_text()
     assert 'Drawing it took' in page
     assert base64.b64encode((folder / 'film.png').read_bytes()).decode() in page
+    coded = base64.b64encode((folder / 'film.mp4').read_bytes()).decode()
+    assert f'src="data:video/mp4;base64,{coded}"></video>' in page
 
     # where nothing can be drawn, the report goes on and keeps the frames that there are
     monkeypatch.setenv('MUJOCO_GL', 'disable')

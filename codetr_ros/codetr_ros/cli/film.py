@@ -1,5 +1,5 @@
-"""The film strip of a run's report: an episode of the random policy, of the policy half-way, and
-of the last one.
+"""The film strip and the video of a run's report: an episode of the random policy, of the policy
+half-way, and of the last one.
 
 It is drawn in a process of its own (see `rendering`): `python -m codetr_ros.cli.film FOLDER`.
 """
@@ -11,9 +11,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from codetr_ros.cli import rendering
+from codetr_ros.cli import rendering, video
 from codetr_ros.runs import folder as run_folder
-from codetr_ros.system.files import atomic_write
+from codetr_ros.system.files import atomic_write, sync_folder
 
 if TYPE_CHECKING:
     from codetr_ros.config import Settings
@@ -26,6 +26,8 @@ DEADLINE = 30.0
 """Seconds after which a film is given up; one of a task with a name takes a few."""
 FRAMES = 5
 WIDTH, HEIGHT = 240, 180
+SECONDS = 3.0
+"""Of each episode, from its beginning, in the video: drawing takes longer than the robot does."""
 
 HELP = (
     'draw the robot under the random, the middle and the last policy for the report; takes seconds'
@@ -112,16 +114,24 @@ def draw(folder: Path, settings: 'Settings', policies: 'Sequence[Policy]') -> st
         acting = acting_policy(policy, environment, settings)
         assert acting is not None, 'newest_policy gives none that is random'
         acts[f'after {settings.steps_after(policy.version)} steps'] = _by(acting)
+    pace = video.Pace.of(environment.control_period)
+    most = round(SECONDS * pace.rate)
+
+    def first() -> None:
+        begin(runner, settings.seed, 0)
+
     with Drawing(environment, WIDTH, HEIGHT) as drawing:
-        rows = {
-            name: _moments(runner, lambda: begin(runner, settings.seed, 0), act, drawing.frame)
-            for name, act in acts.items()
-        }
+        rows = {n: _moments(runner, first, act, drawing.frame) for n, act in acts.items()}
+        moving = [
+            _moving(runner, first, act, drawing.frame, pace.every, most) for act in acts.values()
+        ]
     atomic_write(folder / run_folder.FILM, strip(rows))
+    _write_video(folder / run_folder.FILM_VIDEO, moving, pace)
     lengths = ', '.join(f'{name} {moments[-1][0]} steps' for name, moments in rows.items())
     return (
         'An episode of each policy from the same start, that of the first episode of every '
-        f'evaluation, evenly cut into {FRAMES} moments. It lasted: {lengths}.'
+        f'evaluation, evenly cut into {FRAMES} moments. It lasted: {lengths}. The video has the '
+        f'first {SECONDS:g} s of each, in the same order from left to right.'
     )
 
 
@@ -151,6 +161,39 @@ def _moments(
             runner.step(act(runner))
         moments.append((step, frame().copy()))
     return moments
+
+
+def _moving(
+    runner: 'EpisodeRunner',
+    begin: Callable[[], None],
+    act: Act,
+    frame: Callable[[], 'Frame'],
+    every: int,
+    most: int,
+) -> 'list[Frame]':
+    """Frames of the beginning of an episode, of every so many steps, at the most so many."""
+    begin()
+    frames = [frame().copy()]
+    while not runner.over and len(frames) < most:
+        runner.step(act(runner))
+        if runner.length % every == 0 or runner.over:
+            frames.append(frame().copy())
+    return frames
+
+
+def _write_video(file: Path, episodes: 'Sequence[Sequence[Frame]]', pace: video.Pace) -> None:
+    """Episodes side by side; of one that has ended, the last frame stays."""
+    import numpy as np
+
+    partial = video.partial_of(file)
+    try:
+        with pace.writing(partial, (WIDTH * len(episodes), HEIGHT)) as put:
+            for i in range(max(map(len, episodes))):
+                put(np.hstack([frames[min(i, len(frames) - 1)] for frames in episodes]))
+        os.replace(partial, file)
+        sync_folder(file.absolute().parent)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def strip(rows: Mapping[str, Moments]) -> bytes:

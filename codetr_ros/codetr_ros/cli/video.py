@@ -60,13 +60,15 @@ class Pace:
         return 1 / (self.step * self.every)
 
     @contextmanager
-    def writing(self, file: Path) -> 'Iterator[Callable[[Frame], None]]':
-        """What writes frames to a file."""
+    def writing(
+        self, file: Path, size: tuple[int, int] = (WIDTH, HEIGHT)
+    ) -> 'Iterator[Callable[[Frame], None]]':
+        """What writes frames of a size, width and height, to a file."""
         from imageio_ffmpeg import write_frames
 
         writer = write_frames(
             str(file),
-            (WIDTH, HEIGHT),
+            size,
             fps=self.rate,
             macro_block_size=2,
             output_params=['-v', 'error'],
@@ -120,7 +122,7 @@ def make(
     """
     arguments = (str(folder), str(file), str(settings.evaluate_episodes), str(settings.seed))
     given = {**environment, **launcher.module_environment(settings, environment)}
-    partial = _partial(file)
+    partial = partial_of(file)
     try:
         drawn = rendering.draw([*program, *arguments], partial, DEADLINE, given)
         if drawn.driver is not None:
@@ -137,7 +139,7 @@ def make(
     )
 
 
-def _partial(file: Path) -> Path:
+def partial_of(file: Path) -> Path:
     """Where a video is written first; ffmpeg knows its format by the end of its name."""
     return file.with_name(f'.{file.stem}.partial{SUFFIX}')
 
@@ -151,7 +153,7 @@ def main(arguments: Sequence[str]) -> int:
 
         changes = {'evaluate_episodes': int(episodes), 'seed': int(seed)}
         settings = evaluate.settings_to_read(Path(folder)).changed(changes, 'video')
-        return film(Path(folder), _partial(Path(file)), settings)
+        return film(Path(folder), partial_of(Path(file)), settings)
 
     return rendering.run(made, WIDTH, HEIGHT)
 

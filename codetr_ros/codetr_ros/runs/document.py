@@ -20,7 +20,7 @@ h1 { font-size: 1.4rem; line-height: 1.3; overflow-wrap: anywhere }
 h2 { font-size: 1.15rem; margin-top: 2.2rem }
 h3 { font-size: 1rem }
 p, li { max-width: 46rem }
-img { max-width: min(100%, 46rem); height: auto; background: #fff }
+img, video { max-width: min(100%, 46rem); height: auto; background: #fff }
 pre { background: #8882; padding: .6rem; overflow-x: auto; font-size: .85em }
 .wide { overflow-x: auto }
 table { border-collapse: collapse }
@@ -97,6 +97,14 @@ class Picture:
 
 
 @dataclass(frozen=True)
+class Video:
+    """An MP4 that the HTML page holds itself."""
+
+    source: bytes
+    alt: str
+
+
+@dataclass(frozen=True)
 class Gallery:
     """Small pictures, beside each other where there is room."""
 
@@ -125,7 +133,8 @@ class Folded:
     blocks: 'Sequence[Block]'
 
 
-Block = Heading | Paragraph | Items | Table | Facts | Picture | Gallery | Links | Verbatim | Folded
+Shown = Picture | Video | Gallery
+Block = Heading | Paragraph | Items | Table | Facts | Shown | Links | Verbatim | Folded
 
 
 def cell(value: Any) -> str:
@@ -175,6 +184,8 @@ def _markdown(block: Block) -> str:
             if isinstance(source, bytes):
                 raise ValueError(f'picture {alt!r}: Markdown holds no bytes; give it a file name')
             return f'![{alt}]({source})'
+        case Video(_, alt):
+            raise ValueError(f'video {alt!r}: Markdown holds no bytes')
         case Gallery(pictures):
             return '\n'.join(_markdown(picture) for picture in pictures)
         case Links(rows):
@@ -223,7 +234,7 @@ def _plain(block: Block) -> str:
             return _aligned(pairs, left=True)
         case Folded(title, blocks):
             return '\n\n'.join([title, *filter(None, map(_plain, blocks))])
-        case Picture() | Gallery():
+        case Picture() | Video() | Gallery():
             return ''
 
 
@@ -267,6 +278,12 @@ def _html(block: Block) -> str:
             if isinstance(source, bytes):
                 source = f'data:image/png;base64,{base64.b64encode(source).decode()}'
             return f'<img alt="{html.escape(alt)}" src="{html.escape(source)}">'
+        case Video(data, alt):
+            coded = base64.b64encode(data).decode()
+            return (
+                f'<video aria-label="{html.escape(alt)}" controls loop muted playsinline '
+                f'src="data:video/mp4;base64,{coded}"></video>'
+            )
         case Gallery(pictures):
             return f'<div class="gallery">{"".join(_html(each) for each in pictures)}</div>'
         case Links(rows):

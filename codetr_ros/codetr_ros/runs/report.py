@@ -1,7 +1,7 @@
 """The report of a run for people: a picture of the learning curve and one HTML page.
 
-Everything comes from the run's folder: `summary.json`, and `metrics.csv`, `step_rewards.csv` and
-`film.png` where they are.
+Everything comes from the run's folder: `summary.json`, and `metrics.csv`, `step_rewards.csv`,
+`film.png` and `film.mp4` where they are.
 """
 
 import math
@@ -19,6 +19,7 @@ from codetr_ros.runs.document import (
     Paragraph,
     Picture,
     Table,
+    Video,
     facts,
 )
 from codetr_ros.runs.numbers import column
@@ -53,6 +54,7 @@ class Material:
         columns: of `metrics.csv`.
         segments: some, step by step.
         film: a picture of the robot under its policies; None if there is none.
+        video: the robot under these policies, moving; None if there is none.
         film_note: what to know about it, or why there is none.
         files: those of the run's folder, each with what it is.
         notes: what could not be read.
@@ -61,6 +63,7 @@ class Material:
     columns: dict[str, course.Points] = field(default_factory=dict)
     segments: Sequence[Segment] = ()
     film: bytes | None = None
+    video: bytes | None = None
     film_note: str = ''
     files: Sequence[tuple[str, str]] = ()
     notes: Sequence[str] = ()
@@ -183,6 +186,8 @@ def _film(given: Material) -> Iterator[Block]:
     yield Heading('The robot under the first, the middle and the last policy')
     if given.film is not None:
         yield Picture(given.film, 'frames of an episode of each policy')
+    if given.video is not None:
+        yield Video(given.video, 'the beginning of these episodes, side by side')
     if given.film_note:
         yield Paragraph(given.film_note)
 
@@ -279,11 +284,12 @@ def _material(folder: Path, film_note: str) -> Material:
             shown = segments.read_csv(folder / run_folder.STEP_REWARDS)
     except run_folder.RunFolderError as error:
         notes.append(str(error))
-    film = folder / run_folder.FILM
+    film, video = (folder / name for name in (run_folder.FILM, run_folder.FILM_VIDEO))
     return Material(
         columns=columns,
         segments=shown,
         film=film.read_bytes() if film.is_file() else None,
+        video=video.read_bytes() if video.is_file() else None,
         film_note=film_note,
         files=[
             (name + '/' * (folder / name).is_dir(), what)

@@ -213,7 +213,8 @@ function showPictures(pictures) {
     const shown = video
       ? make('video', { attributes: { src: source, controls: '', loop: '', 'aria-label': name } })
       : make('img', { attributes: { src: source, alt: 'frames of an episode of each policy' } });
-    const words = video ? name : `${name}: an episode of the first, a later and the last policy`;
+    const film = name.startsWith('film.');
+    const words = film ? `${name}: an episode of the first, a later and the last policy` : name;
     return make('figure', { children: [shown, make('figcaption', { text: words })] });
   });
   at('pictures').replaceChildren(...figures);
