@@ -1,54 +1,45 @@
-"""Simulators that are killed and started again, at any moment, are as if nothing had happened."""
+"""Nodes of every role that are killed and started again, at any moment, are as if nothing had
+happened.
+"""
 
-import random
 from dataclasses import replace
 
 import pytest
 
-from codetr_ros.simtest.disks import Trouble
-from codetr_ros.simtest.network import Weather
 from codetr_ros.simtest.plan import Death, all_settings, plan
-from codetr_ros.simtest.process import Pace
 from codetr_ros.simtest.run import carry_out
+from helpers.deaths import ROLES, deadly
 from helpers.leaving import TWO, leaving
 
-
-def deadly(number):
-    """A run of one kind whose simulators are killed by what a number draws: several at once, and
-    some twice in a row.
-    """
-    planned, draws = plan(number), random.Random(f'deaths {number}')
-    names = planned.settings.simulator_names
-    paces = {name: Pace(slice_seconds=0.2) for name in planned.paces}
-    paces['learner'] = Pace(slice_seconds=2.0)
-    deaths = []
-    for _ in range(draws.randint(1, 3)):
-        at = draws.uniform(1.0, 5)
-        for name in draws.sample(names, draws.randint(1, len(names))):
-            deaths.append(Death(name, at, draws.uniform(0.5, 10)))
-    return replace(
-        planned,
-        paces=paces,
-        weather=Weather(delay=0.02, reorder=True, doubled=0.1),
-        disk=Trouble(),
-        heals=True,
-        deaths=tuple(deaths),
-    )
+RRD = next(i for i, each in enumerate(all_settings()) if each.method == 'rrd')
+EACH = (*((role,) for role in ROLES), ROLES)
+"""One role at a time, then all."""
 
 
-def test_they_are_killed_in_most_of_these_runs():
-    killed = [
-        sum('is killed' in line for line in carry_out(deadly(number), kept=10_000).trace)
-        for number in range(4)
-    ]
-    assert sum(map(bool, killed)) >= 3 and max(killed) > 1
-
-
-@pytest.mark.parametrize('number', range(len(all_settings())))
-def test_killed_simulators_come_back_and_the_weights_are_the_same(number):
-    ended = carry_out(deadly(number), kept=10_000)
+@pytest.mark.parametrize('roles', EACH, ids=' '.join)
+def test_killed_nodes_come_back_and_the_weights_are_the_same(roles):
+    ended = carry_out(deadly(plan(1), roles), kept=20_000)
     assert ended.failures == []
     assert ended.errors == {}
+    assert any('is started again' in line for line in ended.trace)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('number', range(len(all_settings())))
+def test_they_do_in_every_kind_of_run(number):
+    ended = carry_out(deadly(plan(number)))
+    assert ended.failures == []
+    assert ended.errors == {}
+
+
+def test_a_checkpoint_that_is_torn_is_passed_over_and_the_weights_are_the_same():
+    planned = deadly(plan(RRD), ())
+    deaths = tuple(Death(name, 9.0, 1.0, power=True) for name in ('reward', 'learner'))
+    ended = carry_out(replace(planned, deaths=deaths), kept=20_000)
+    assert ended.failures == []
+    assert ended.errors == {}
+    assert sum(' torn' in line for line in ended.trace) == 2
+    assert any('goes on from' in line or 'no checkpoint' in line for line in ended.trace)
 
 
 @pytest.mark.parametrize(('seconds', 'left_out'), [(0.5, 0), (2.0, 0), (8.0, 1)])

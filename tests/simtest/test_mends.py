@@ -8,11 +8,13 @@ from dataclasses import replace
 
 import pytest
 
-from codetr_ros.bags import writer
+from codetr_ros.bags import reopening, writer
 from codetr_ros.cores import announced, held, intake, learner, recorder
 from codetr_ros.nodes import (
     catching_up,
     fetching,
+    keeping,
+    outbox,
     patience,
     peers,
     settling,
@@ -21,11 +23,14 @@ from codetr_ros.nodes import (
 )
 from codetr_ros.nodes.kept_run import KeptRun
 from codetr_ros.records import TOPICS, Policy, StepRewards
+from codetr_ros.runs import checkpoints
+from codetr_ros.simtest import process
 from codetr_ros.simtest.disks import Trouble
 from codetr_ros.simtest.network import Weather
 from codetr_ros.simtest.plan import all_settings, plan
 from codetr_ros.simtest.process import Pace
 from codetr_ros.simtest.run import carry_out, undisturbed
+from helpers.deaths import deadly
 
 MOST = 150
 """Seeds that are tried."""
@@ -235,6 +240,34 @@ def keep_policies_and_labels_in_any_order(patch):
     patch.setattr(recorder.Recorder, '_place', place)
 
 
+def leave_the_bag_of_a_killed_recorder_as_it_is(patch):
+    patch.setattr(reopening, 'mend', lambda folder, disk: None)
+
+
+def ask_nobody_what_a_killed_recorder_has_missed(patch):
+    patch.setattr(keeping.Keeping, 'go_on', lambda self: self._by.begin_counting_anew())
+
+
+def begin_from_the_start(patch):
+    patch.setattr(process, 'go_on', lambda node: (each for each in ()))
+
+
+def go_on_from_a_torn_checkpoint(patch):
+    def sound(folder, name, newest=None, log=None):
+        for path in reversed(checkpoints.every(folder, name)):
+            tensors, meta = checkpoints.load(path)
+            yield checkpoints.Checkpoint(path, checkpoints.phase_of(path), tensors, meta)
+
+    patch.setattr(checkpoints, 'sound', sound)
+
+
+def forget_what_was_published(patch):
+    def read(self, phase, kinds=()):
+        raise KeyError(f'phase {phase} is not kept')
+
+    patch.setattr(outbox.Outbox, 'read', read)
+
+
 MENDS: dict[Callable, str] = {
     accept_duplicates: 'other weights|not sound|are whole|gave up|stuck',
     accept_gaps: 'not sound|are whole|other weights',
@@ -265,6 +298,11 @@ MENDS: dict[Callable, str] = {
     never_sweep: 'gave up',
     forget_early_ones_when_the_gap_before_them_is_filled: 'gave up',
     keep_policies_and_labels_in_any_order: 'not sound',
+    leave_the_bag_of_a_killed_recorder_as_it_is: 'not sound|gave up|cannot be read|fault',
+    ask_nobody_what_a_killed_recorder_has_missed: 'not sound|gave up',
+    begin_from_the_start: 'gave up|other weights|stuck|not sound|fault',
+    go_on_from_a_torn_checkpoint: 'gave up',
+    forget_what_was_published: 'gave up|not sound',
 }
 
 
@@ -302,6 +340,11 @@ PLANS = {
     never_sweep: lossy,
     forget_early_ones_when_the_gap_before_them_is_filled: lossy,
     keep_policies_and_labels_in_any_order: lossy,
+    leave_the_bag_of_a_killed_recorder_as_it_is: deadly,
+    ask_nobody_what_a_killed_recorder_has_missed: deadly,
+    begin_from_the_start: deadly,
+    go_on_from_a_torn_checkpoint: deadly,
+    forget_what_was_published: deadly,
 }
 """What is rare among the seeds is planned."""
 

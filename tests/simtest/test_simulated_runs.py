@@ -14,7 +14,7 @@ from codetr_ros.simtest.plan import DEADLINE, all_settings, plan
 from codetr_ros.simtest.process import Pace
 from codetr_ros.simtest.run import carry_out, simulate
 
-QUICK, MANY = range(24), range(24, 200)
+QUICK, MANY = range(24), range(24, 120)
 FOUND = (475,)
 """Seeds beyond those that once failed."""
 
@@ -47,6 +47,7 @@ def test_seeds_draw_every_kind_of_run_and_every_kind_of_trouble():
         lambda p: p.weather.reorder,
         lambda p: p.weather.partitions,
         lambda p: any(pace.stalls for pace in p.paces.values()),
+        lambda p: p.deaths,
         lambda p: p.disk.room is not None,
         lambda p: p.disk.syncs is not None,
         lambda p: p.calm,

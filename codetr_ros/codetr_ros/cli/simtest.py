@@ -23,10 +23,10 @@ MOST_SHOWN = 20
 class Arguments:
     """Simulate whole runs in one process, in virtual time, with troubles drawn from a seed.
 
-    Messages come late, twice, out of order or never; nodes stall, or do not reach each other;
-    disks are full or fail to sync. A run must end with the weights of the undisturbed run, or
-    with an error that names its cause. A seed always gives the same run. Exit code 0: all of that
-    held, 1: it did not.
+    Messages come late, twice, out of order or never; nodes stall, are killed and come back, or do
+    not reach each other; disks are full or fail to sync. A run must end with the weights of the
+    undisturbed run, or with an error that names its cause. A seed always gives the same run. Exit
+    code 0: all of that held, 1: it did not.
     """
 
     seed: Annotated[

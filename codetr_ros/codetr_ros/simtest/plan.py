@@ -61,7 +61,8 @@ class Death:
         name: of the node.
         at: when [s].
         seconds: until it is there again.
-        power: whether its machine loses its power, and so what is not synced to its disk.
+        power: whether its machine loses its power: a recorder then loses what it has not synced,
+            and the newest checkpoint of a learner or reward node is torn.
     """
 
     name: str
@@ -109,6 +110,7 @@ class Plan:
             or weather.partitions
             or any(pace.stalls for pace in self.paces.values())
             or self.disk != Trouble()
+            or self.deaths
         )
 
     @property
@@ -118,9 +120,10 @@ class Plan:
 
     @property
     def silent(self) -> float:
-        """How long nodes stall or do not reach each other, all together [s]."""
+        """How long nodes stall, are dead or do not reach each other, all together [s]."""
         stalls = sum(length for pace in self.paces.values() for _, length in pace.stalls)
-        return stalls + sum(each.seconds for each in self.weather.partitions)
+        dead = sum(each.seconds for each in self.deaths)
+        return stalls + dead + sum(each.seconds for each in self.weather.partitions)
 
     def in_words(self) -> list[str]:
         """What is planned, for people."""
@@ -155,6 +158,11 @@ class Plan:
             lines.append(f'the disk of the recorder has room for {self.disk.room} bytes')
         if self.disk.syncs is not None:
             lines.append(f'the disk of the recorder syncs {self.disk.syncs} times')
+        lines += [
+            f'{death.name} is killed at {death.at:.1f} s for {death.seconds:.1f} s'
+            f'{", and its machine loses its power" if death.power else ""}'
+            for death in self.deaths
+        ]
         if self.leave_out_after:
             lines.append(f'who is silent for {self.leave_out_after:.1f} s is left out')
         lines.append('must end as if nothing had happened' if self.heals else 'may fail by name')
@@ -198,18 +206,18 @@ def plan(seed: int) -> Plan:
         disk.room = rng.randint(0, 60_000)
     if some.happens(0.06):
         disk.syncs = rng.randint(0, 6)
-    silent = sum(each.seconds for each in partitions)
-    silent += sum(length for pace in paces.values() for _, length in pace.stalls)
-    heals = (
-        disk == Trouble()
-        and all(each.seconds <= LEASE for each in partitions)
-        and silent < DEADLINE / 2
-    )
     # drawn last: what a seed drew before stays as it was
     leave_out_after = rng.choice((0.0, 3.0, 12.0)) if settings.simulators > 1 else 0.0
     unanswered = rng.uniform(0.01, 0.1) if some.happens(0.3) else 0.0
     weather = replace(weather, unanswered=unanswered)
-    return Plan(seed, settings, weather, paces, disk, heals, leave_out_after)
+    deaths = _deaths(rng, names) if some.happens(0.3) else ()
+    made = Plan(seed, settings, weather, paces, disk, False, leave_out_after, deaths)
+    heals = (
+        disk == Trouble()
+        and all(each.seconds <= LEASE for each in partitions)
+        and made.silent < DEADLINE / 2
+    )
+    return replace(made, heals=heals)
 
 
 class _Drawn:
@@ -243,6 +251,16 @@ def _length(rng: random.Random) -> float:
 def _partition(rng: random.Random, names: list[str]) -> Partition:
     apart = frozenset(rng.sample(names, rng.randint(1, len(names) - 1)))
     return Partition(rng.uniform(0, BUSY), _length(rng), apart)
+
+
+def _deaths(rng: random.Random, names: list[str]) -> tuple[Death, ...]:
+    """Up to three times, some nodes or one: several at once, and some twice in a row."""
+    deaths = []
+    for _ in range(rng.randint(1, 3)):
+        at, power = rng.uniform(0.5, BUSY), rng.random() < 0.3
+        for name in rng.sample(names, rng.choice((1, 1, rng.randint(1, len(names))))):
+            deaths.append(Death(name, at, rng.uniform(0.5, 10), power))
+    return tuple(deaths)
 
 
 def _stall(rng: random.Random) -> tuple[float, float]:

@@ -135,6 +135,7 @@ class Process:
         error: why it gave up; None if it has not.
         over: whether it has done everything, and stays for those that lack what it has published.
         ended: whether it has taken its last turn.
+        killed: whether that was because it was killed.
         finished: whether its core was, when it ended.
         ended_at: when that was [s].
         repeated: second copies that it has taken, by topic.
@@ -151,7 +152,7 @@ class Process:
         self.world, self.mail, self.run = place.world, place.mail, place.run
         self.role, self.name = place.role, place.name
         self.error: Exception | None = None
-        self.over = self.ended = self.finished = False
+        self.over = self.ended = self.killed = self.finished = False
         self.ended_at = 0.0
         self.repeated: Counter[str] = Counter()
         self.set_aside: Counter[str] = Counter()
@@ -466,7 +467,7 @@ class Process:
 
     def die(self) -> None:
         """End at once: nobody hears of it, and nothing is saved."""
-        self.ended = True
+        self.ended = self.killed = True
         self.world.note(self.name, 'is killed')
 
     def settled(self, seconds: float) -> bool:

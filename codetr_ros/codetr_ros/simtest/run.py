@@ -1,6 +1,7 @@
 """One simulated run, and what must be true of it."""
 
 import logging
+import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,6 +24,7 @@ from codetr_ros.cores.recorder import Recorder
 from codetr_ros.cores.simulator import Simulator
 from codetr_ros.nodes import errors
 from codetr_ros.records import Commit, Record, RunSpec
+from codetr_ros.runs import checkpoint_names
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.simtest import checks
 from codetr_ros.simtest.disks import TroubledDisk
@@ -154,10 +156,22 @@ class Simulated:
             return
         killed.die()
         if death.power:
-            self.disk.lose_power(self.world.rng)
+            self._lose_power(killed)
         self._dead += 1
         again = partial(self._start_again, killed)
         self.world.at(self.world.now + death.seconds, again)
+
+    def _lose_power(self, killed: Process) -> None:
+        """Lose what a node has not synced; or have its newest checkpoint torn, which is worse."""
+        rng = self.world.rng
+        if isinstance(killed, Recording):
+            self.disk.lose_power(rng)
+        elif self._checkpoints is not None and killed.role in ('reward', 'learner'):
+            newest = checkpoint_names.latest(self._checkpoints, killed.role)
+            if newest is not None:
+                file = rng.choice(sorted(newest.iterdir()))
+                os.truncate(file, rng.randint(0, file.stat().st_size - 1))
+                self.world.note(killed.name, f'finds {newest.name} torn')
 
     def _start_again(self, killed: Process) -> None:
         """Start a node that was killed: it goes on where the run stands."""
