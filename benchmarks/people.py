@@ -10,7 +10,8 @@ where it ended.
 Columns of results/people.csv: the task, judgements that people may give in the run (`oracle`: true
 rewards), points of their scale, segments asked for
 in each phase, share of preferences, people, seed, judgements that were given,
-mean true return of the last evaluation and of the random policy, and the wall time. The goal is
+mean true return of the last evaluation and of the random policy, the wall time, and the commit of
+the program. Rows of older commits stay as long as the program does the same runs. The goal is
 90 % of the way from the random policy to the oracle with 60 judgements.
 """
 
@@ -23,6 +24,7 @@ from typing import Any
 import torch
 from rows import Rows
 
+import machine
 from codetr_ros.config import Settings, load
 from codetr_ros.cores import in_process
 from codetr_ros.records import CompositeReward, EpisodeResult, Preference, Record
@@ -30,7 +32,7 @@ from codetr_ros.records import CompositeReward, EpisodeResult, Preference, Recor
 RESULTS = Path(__file__).parent / 'results' / 'people.csv'
 COLUMNS = (
     *('task', 'budget', 'points', 'requests', 'preferences', 'people', 'seed'),
-    *('given', 'final', 'random', 'wall_s'),
+    *('given', 'final', 'random', 'wall_s', 'commit'),
 )
 TASKS: dict[str, dict[str, Any]] = {
     'Reacher-v5': {'delay': 50, 'steps': 20_000, 'people.best': -3.0},
@@ -126,6 +128,7 @@ def main() -> None:
     parser.add_argument('--requests', type=int, default=0, help='0: even over the run')
     given = parser.parse_args()
     torch.set_num_threads(1)
+    commit = machine.commit()
     table = Rows(RESULTS, COLUMNS, keys=7)
     for seed in range(given.seeds):
         for budget in ('oracle', *given.budgets):
@@ -137,7 +140,7 @@ def main() -> None:
                     how = (given.points, requests, given.preferences, given.people)
                 key = (task, budget, *how, seed)
                 if key not in table:
-                    table.append([*key, *done(task, budget, *how, seed)])
+                    table.append([*key, *done(task, budget, *how, seed), commit])
 
 
 if __name__ == '__main__':

@@ -14,6 +14,8 @@ WIDTH, HEIGHT, GAP = 380, 680, 12  # of each picture, and between two [pixels of
 SHARP = 2  # pixels of the strip for each of these
 PATIENCE = 180.0  # [s]
 ADDRESS = re.compile(r'(score as you|watch \S+) at (http\S+)')
+LEARNT = re.compile('^(8|9|1[0-9]|20) of')
+"""Phases after which what is inferred is shown."""
 STRIP = """<!doctype html><style>
 body {{ margin: 0; padding: 4px; font: 600 19px sans-serif; background: #fff; color: #111; }}
 main {{ display: grid; grid-template-columns: repeat({count}, {width}px); gap: {gap}px; }}
@@ -66,7 +68,9 @@ def moments(context: Any, pages: dict[str, str]) -> Iterator[tuple[str, Any]]:
     score.get_by_role('cell', name=re.compile('^phase')).first.wait_for()
     at_top(score, '#points')
     yield 'Scored, corrected, learnt', score
-    watch.locator('#rewards canvas').first.wait_for()
+    # by then the rewards are those of more than a few scores
+    watch.locator('#facts dd', has_text=LEARNT).first.wait_for()
+    watch.locator('#rewards .u-legend', has_text='right axis').wait_for()
     at_top(watch, '#h-episode')
     yield 'Rewards, inferred and true', watch
 
