@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from codetr_ros.simtest.disks import Trouble
 from codetr_ros.simtest.plan import Death, all_settings, plan
 from codetr_ros.simtest.run import carry_out
 from helpers.deaths import ROLES, deadly
@@ -40,6 +41,26 @@ def test_a_checkpoint_that_is_torn_is_passed_over_and_the_weights_are_the_same()
     assert ended.errors == {}
     assert sum(' torn' in line for line in ended.trace) == 2
     assert any('goes on from' in line or 'no checkpoint' in line for line in ended.trace)
+
+
+@pytest.mark.parametrize('power', [False, True])
+@pytest.mark.parametrize('call', [0, 3, 11])
+def test_whoever_is_killed_within_a_call_of_its_disk_comes_back_and_the_weights_are_the_same(
+    call, power
+):
+    planned = deadly(plan(RRD), ())
+    trouble = Trouble(kills_in=call, power=power)
+    ended = carry_out(replace(planned, disk=trouble, checkpoints=trouble), kept=20_000)
+    assert ended.failures == []
+    assert ended.errors == {}
+    assert sum('is killed' in line for line in ended.trace) == 2
+
+
+def test_a_full_disk_of_checkpoints_ends_the_run_by_an_error_that_names_it():
+    planned = replace(deadly(plan(RRD), ()), checkpoints=Trouble(room=4000), heals=False)
+    ended = carry_out(planned)
+    assert ended.failures == []
+    assert any('No space left on device' in error for error in ended.errors.values())
 
 
 @pytest.mark.parametrize(('seconds', 'left_out'), [(0.5, 0), (2.0, 0), (8.0, 1)])

@@ -24,7 +24,7 @@ from codetr_ros.nodes import (
 from codetr_ros.nodes.kept_run import KeptRun
 from codetr_ros.records import TOPICS, Policy, StepRewards
 from codetr_ros.runs import checkpoints
-from codetr_ros.simtest import process
+from codetr_ros.simtest import disks, process
 from codetr_ros.simtest.disks import Trouble
 from codetr_ros.simtest.network import Weather
 from codetr_ros.simtest.plan import all_settings, plan
@@ -261,6 +261,14 @@ def go_on_from_a_torn_checkpoint(patch):
     patch.setattr(checkpoints, 'sound', sound)
 
 
+def name_a_checkpoint_before_it_is_on_the_disk(patch):
+    def write(self, path, data):
+        with self.create(path) as file:
+            file.write(data)
+
+    patch.setattr(disks.TroubledDisk, 'write', write)
+
+
 def forget_what_was_published(patch):
     def read(self, phase, kinds=()):
         raise KeyError(f'phase {phase} is not kept')
@@ -303,6 +311,7 @@ MENDS: dict[Callable, str] = {
     begin_from_the_start: 'gave up|other weights|stuck|not sound|fault',
     go_on_from_a_torn_checkpoint: 'gave up',
     forget_what_was_published: 'gave up|not sound',
+    name_a_checkpoint_before_it_is_on_the_disk: 'has damaged a checkpoint',
 }
 
 
@@ -329,6 +338,13 @@ def drowsy(planned):
     return replace(planned, weather=Weather(delay=0.3, reorder=True), paces=paces, disk=Trouble())
 
 
+def cut_off(planned):
+    """The same run, but that whoever saves a checkpoint is killed, and its machine cut off."""
+    return replace(
+        planned, checkpoints=Trouble(kills_in=planned.seed % 16, power=True), disk=Trouble()
+    )
+
+
 PLANS = {
     forget_who_has_ended: drowsy,
     accept_gaps: overrun,
@@ -345,6 +361,7 @@ PLANS = {
     begin_from_the_start: deadly,
     go_on_from_a_torn_checkpoint: deadly,
     forget_what_was_published: deadly,
+    name_a_checkpoint_before_it_is_on_the_disk: cut_off,
 }
 """What is rare among the seeds is planned."""
 

@@ -25,6 +25,7 @@ from codetr_ros.records import Metrics, Record, RunSpec
 from codetr_ros.runs import checkpoints
 from codetr_ros.runs.checkpoints import Checkpoint
 from codetr_ros.runs.reports import CoreReport, MemoryFacts
+from codetr_ros.system.disk import Disk
 
 _log = logging.getLogger(__name__)
 
@@ -39,6 +40,9 @@ class Consumer(Part, ABC):
         folder: where checkpoints go; None: no checkpoints.
         scores: whether composite rewards are taken in.
         true_rewards: whether the environment's own rewards are taken in: in-process oracle only.
+
+    Attributes:
+        disk: where checkpoints lie.
     """
 
     role: ClassVar[str]
@@ -58,6 +62,7 @@ class Consumer(Part, ABC):
         self._settings = settings
         self._name = name
         self._folder = folder
+        self.disk = Disk()
         self._scores = scores
         self._true_rewards = true_rewards
         self._intake = Intake(run, settings, scores, true_rewards, lambda: self.permitted)
@@ -287,7 +292,7 @@ class Consumer(Part, ABC):
         tensors = self._state() | going_on.memory_tensors(self._memory)
         # a run goes on from `lag` phases before its last commit, and one before that is kept
         keep = self._settings.lag + 2
-        checkpoints.save(self._folder, self.role, done, tensors, meta, keep)
+        checkpoints.save(self._folder, self.role, done, tensors, meta, keep, self.disk)
         self._saved = done
 
     def report(self) -> CoreReport:

@@ -43,6 +43,9 @@ RECORDED_TOPICS = [TOPICS[kind] for kind in RECORDED]
 CATCH_UP = 10.0
 """The most seconds that a recorder which was held takes to ask others for what it has missed. They
 keep it for some phases only, so that it commits none meanwhile."""
+ASKS_ALL = (5.0, 30.0)
+"""For how long [s] all others have waited when all of them are asked for what is lacking; behind
+that it is nothing that they have."""
 JUDGEMENTS = (CompositeReward, Preference)
 
 
@@ -270,6 +273,15 @@ class Keeping:
         self._early = due
         lost = {TOPICS[type(record)] for record in due.values()}
         self._ask_again([*lost, *self._traffic.lost(RECORDED_TOPICS)])
+        if self._nobody_works():
+            self._sweeper.ask(self._nodes(), lacking=True)
+
+    def _nobody_works(self) -> bool:
+        """Whether all others have waited for a while, so that something is lacking which no count
+        shows: after a node was killed, what was under way is not counted.
+        """
+        there = [each.presence for each in self._by.peers.newest() if not each.presence.finished]
+        return bool(there) and ASKS_ALL[0] < min(each.waiting for each in there) < ASKS_ALL[1]
 
     def _leave_out(self) -> None:
         """Go on without simulators that are silent, if there are others."""
@@ -293,7 +305,7 @@ class Keeping:
 
     def _ask_again(self, lost: Collection[str]) -> None:
         """Ask those who publish on these topics for what was lost."""
-        roles = {role for topic in lost for role in WRITERS[topic]}
+        roles = sorted({role for topic in lost for role in WRITERS[topic]})
         self._sweeper.ask(self._nodes(roles), lacking=True)
         self._sweeper.check()
 

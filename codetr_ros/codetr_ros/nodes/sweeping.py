@@ -49,6 +49,7 @@ class Sweeper:
         self._thorough: set[str] = set()  # nodes that are to be asked for all that they keep
         self._present: str | None = None  # the node that is asked
         self._phases: list[list[tuple[type, bytes]]] = []  # what it has sent, newest first
+        self._round = 0  # counts questions
         self._news = 0  # phases since one had something new
 
     def ask(self, nodes: Iterable[str], lacking: bool = False) -> None:
@@ -85,11 +86,19 @@ class Sweeper:
             if asker.ready:
                 del self._wanted[node]
                 self._present, self._phases, self._news = node, [], 0
-                asker.ask(NEWEST, self._answered)
+                self._ask(NEWEST)
                 return
 
-    def _answered(self, answer: Answer) -> None:
-        assert self._present is not None
+    def _ask(self, phase: int) -> None:
+        node = self._present
+        assert node is not None
+        self._round += 1
+        asked = self._round
+        self._askers[node].ask(phase, lambda answer: self._answered(asked, answer))
+
+    def _answered(self, asked: int, answer: Answer) -> None:
+        if asked != self._round or self._present is None:
+            return  # too late: it was given up, or another node is asked
         if answer.phase is None:  # it keeps nothing earlier
             self._end()
             return
@@ -98,7 +107,7 @@ class Sweeper:
         self._news = 0 if new else self._news + 1
         goes_on = self._news < UNNEWS or self._present in self._thorough
         if goes_on and answer.phase > 0:
-            self._askers[self._present].ask(answer.phase - 1, self._answered)
+            self._ask(answer.phase - 1)
         else:
             self._end()
 

@@ -11,7 +11,6 @@ never silently replaced by a fresh start.
 import hashlib
 import json
 import logging
-import os
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping
@@ -24,7 +23,8 @@ import safetensors.torch
 import torch
 
 from codetr_ros.runs import checkpoint_names
-from codetr_ros.system.files import make_folder, sync_folder, write_synced
+from codetr_ros.system.disk import Disk
+from codetr_ros.system.files import make_folder, sync_folder
 from codetr_ros.system.parsing import brief, parse_json, shortened
 from codetr_ros.system.tensors import Part
 from codetr_ros.system.tensors import digest as digest_of
@@ -84,6 +84,7 @@ def save(
     tensors: Mapping[str, torch.Tensor],
     meta: Mapping[str, Any],
     keep: int = 3,
+    disk: Disk | None = None,
 ) -> Path:
     """Write a checkpoint, then remove all but the newest `keep` of this name.
 
@@ -94,6 +95,7 @@ def save(
         tensors: the state that consists of tensors, on any device.
         meta: all other state: JSON-able, numbers finite.
         keep: how many checkpoints to keep, at least 1.
+        disk: where it lies; None: the disk of this machine.
 
     Returns:
         The checkpoint's folder.
@@ -129,19 +131,20 @@ def save(
             f'checkpoint {name}, phase {phase}: meta cannot be written as JSON: {error}'
         ) from None
 
+    disk = disk or Disk()
     make_folder(folder)
     _remove_partial(folder, name)
     path = folder / f'{name}-{phase:06d}'
     partial = folder / f'.{name}-{phase:06d}.partial'
     make_folder(partial)
-    write_synced(partial / TENSORS, data)
-    write_synced(partial / DESCRIPTION, description)
+    disk.write(partial / TENSORS, data)
+    disk.write(partial / DESCRIPTION, description)
     sync_folder(partial)
     if path.exists():
         # A rename cannot replace a folder that is not empty. The name counts as partial: if the
         # machine stops between the two renames, the next older checkpoint is the latest.
-        os.replace(path, folder / f'.{name}-{phase:06d}.replaced.partial')
-    os.replace(partial, path)
+        disk.replace(path, folder / f'.{name}-{phase:06d}.replaced.partial')
+    disk.replace(partial, path)
     sync_folder(folder)
     _remove_partial(folder, name)
     for old in every(folder, name)[:-keep]:

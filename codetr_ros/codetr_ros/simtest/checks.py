@@ -54,7 +54,7 @@ def at_the_end(run: 'Simulated') -> list[str]:
     found += _uncounted(processes)
     found += _bag(run, whole=not gave_up)
     # what was dropped may have come too late for the bag; of the dead nobody knows the counts
-    if not gave_up and not run.dropped() and not run.plan.deaths:
+    if not gave_up and not run.dropped() and not run.plan.kills:
         found += _unrecorded(run)
     return found
 
@@ -99,7 +99,7 @@ def _weights(run: 'Simulated') -> Iterator[str]:
 def _uncounted(processes: list[Process]) -> Iterator[str]:
     """Messages that came twice, and that a core neither counts nor refuses."""
     for each in processes:
-        if each.error is not None:
+        if each.error is not None or each.place.instance > 1:  # that has counts of one before
             continue
         counted = Counter(each.core.duplicated) + each.traffic.refused + each.core.refused
         counted += each.set_aside
@@ -131,7 +131,7 @@ def _unrecorded(run: 'Simulated') -> Iterator[str]:
 def _bag(run: 'Simulated', whole: bool) -> Iterator[str]:
     """The bag holds what was learnt from, and is sound if the run has finished."""
     allowed = set() if whole else {'metadata', 'index'}
-    if not whole and any(reader == 'record' for reader, _ in run.post.network.lost):
+    if not whole and _unheard(run):
         allowed |= {'segment', 'record'}  # of steps that never reached it
     try:
         verdict = verify(run.folder)
@@ -149,8 +149,14 @@ def _lost_with_both(run: 'Simulated') -> bool:
     """
     dead = {death.name for death in run.plan.deaths}
     simulators = {each.name for each in run.processes.values() if each.role == 'sim'}
-    unheard = 'record' in dead or any(reader == 'record' for reader, _ in run.post.network.lost)
-    return bool(dead & simulators) and unheard
+    return bool(dead & simulators) and _unheard(run)
+
+
+def _unheard(run: 'Simulated') -> bool:
+    """Whether messages have not reached the recorder."""
+    killed = any(death.name == 'record' for death in run.plan.deaths)
+    lost = any(reader == 'record' for reader, _ in run.post.network.lost)
+    return killed or lost or run.plan.disk.kills_in is not None
 
 
 def _findings(verdict: Verdict, allowed: set[str], excused: Sequence[str]) -> Iterator[str]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from codetr_ros.system.disk import Disk
+from codetr_ros.system.files import FileError
 
 ROOM = 1 << 30  # bytes free on a disk that is not full
 
@@ -20,10 +21,32 @@ class Trouble:
     Attributes:
         room: bytes that can be written before it is full; None: any number.
         syncs: how many times it syncs before that fails; None: always.
+        kills_in: after how many calls the process that calls is killed within one, once; None:
+            never.
+        power: whether its machine then loses its power, too.
     """
 
     room: int | None = None
     syncs: int | None = None
+    kills_in: int | None = None
+    power: bool = False
+
+    @property
+    def mends(self) -> bool:
+        """Whether a run ends as if nothing had happened all the same."""
+        return self.room is None and self.syncs is None
+
+    def kill(self) -> None:
+        """Kill the process that calls, if it is time."""
+        if self.kills_in is not None:
+            self.kills_in -= 1
+            if self.kills_in < 0:
+                self.kills_in = None
+                raise KilledError
+
+
+class KilledError(BaseException):
+    """A process was killed within a call."""
 
 
 class _File(io.FileIO):
@@ -37,6 +60,11 @@ class _File(io.FileIO):
     def write(self, data: bytes) -> int:  # type: ignore[override]
         if self.abandoned:
             return len(data)
+        try:
+            self._trouble.kill()
+        except KilledError:
+            super().write(memoryview(data)[: len(data) // 2])  # so far it had come
+            raise
         room = self._trouble.room
         if room is None:
             return super().write(data)
@@ -63,6 +91,7 @@ class TroubledDisk(Disk):
 
     def create(self, path: Path) -> BinaryIO:
         """Open a new file."""
+        self.trouble.kill()
         raw = _File(path, self.trouble)
         self._files.append(raw)
         file = io.BufferedWriter(raw)  # type: ignore[type-var]
@@ -73,6 +102,7 @@ class TroubledDisk(Disk):
     def sync(self, file: BinaryIO) -> None:
         """Make what was written so far outlast a loss of power."""
         file.flush()
+        self.trouble.kill()
         if self.trouble.syncs is not None:
             if self.trouble.syncs <= 0:
                 raise OSError(errno.EIO, os.strerror(errno.EIO))
@@ -80,9 +110,21 @@ class TroubledDisk(Disk):
         self.synced[self._paths[id(file)]] = file.tell()
 
     def replace(self, old: Path, new: Path) -> None:
-        """Let a file take the place of another one."""
+        """Let a file or folder take the place of another one."""
+        self.trouble.kill()
         super().replace(old, new)
-        self.synced[new] = self.synced.pop(old)
+        for path in [path for path in self.synced if path.is_relative_to(old)]:
+            self.synced[new / path.relative_to(old)] = self.synced.pop(path)
+
+    def write(self, path: Path, data: bytes) -> None:
+        """Write a whole file, and wait until it is on the disk."""
+        path.unlink(missing_ok=True)  # what a process that was killed had begun
+        try:
+            with self.create(path) as file:
+                file.write(data)
+                self.sync(file)
+        except OSError as error:
+            raise FileError(error.errno, error.strerror, str(path)) from error
 
     def abandon(self) -> None:
         """Lose what a process that was killed had not handed to the system."""

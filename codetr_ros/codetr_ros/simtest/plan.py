@@ -13,6 +13,8 @@ from codetr_ros.simtest.task import TASK
 
 DEADLINE = 60.0
 """How long a node waits for others [s of virtual time]: the default of `peer_deadline`."""
+BACK = 3.0
+"""Seconds until a node is there again that was killed within a call of its disk."""
 BUSY = 8.0
 """Troubles begin within so many seconds, which a run without troubles takes at most."""
 
@@ -81,6 +83,7 @@ class Plan:
         weather: how the network behaves.
         paces: how quickly each node works, by name.
         disk: what is wrong with the recorder's disk.
+        checkpoints: what is wrong with the disk of the checkpoints.
         heals: whether the run must end as if nothing had happened; else it may also end by an
             error that names its cause.
         leave_out_after: seconds of silence after which a source is left out of a phase; 0: never.
@@ -95,6 +98,13 @@ class Plan:
     heals: bool = True
     leave_out_after: float = 0.0
     deaths: tuple[Death, ...] = ()
+    checkpoints: Trouble = field(default_factory=Trouble)
+
+    @property
+    def kills(self) -> bool:
+        """Whether nodes are killed."""
+        within = any(each.kills_in is not None for each in (self.disk, self.checkpoints))
+        return within or bool(self.deaths)
 
     @property
     def calm(self) -> bool:
@@ -110,6 +120,7 @@ class Plan:
             or weather.partitions
             or any(pace.stalls for pace in self.paces.values())
             or self.disk != Trouble()
+            or self.checkpoints != Trouble()
             or self.deaths
         )
 
@@ -123,6 +134,7 @@ class Plan:
         """How long nodes stall, are dead or do not reach each other, all together [s]."""
         stalls = sum(length for pace in self.paces.values() for _, length in pace.stalls)
         dead = sum(each.seconds for each in self.deaths)
+        dead += BACK * sum(each.kills_in is not None for each in (self.disk, self.checkpoints))
         return stalls + dead + sum(each.seconds for each in self.weather.partitions)
 
     def in_words(self) -> list[str]:
@@ -154,10 +166,16 @@ class Plan:
             if pace.slice_seconds > 0.5:
                 lines.append(f'{name} takes {pace.slice_seconds:.1f} s for a slice')
             lines += [f'{name} stalls at {a:.1f} s for {b:.1f} s' for a, b in pace.stalls]
-        if self.disk.room is not None:
-            lines.append(f'the disk of the recorder has room for {self.disk.room} bytes')
-        if self.disk.syncs is not None:
-            lines.append(f'the disk of the recorder syncs {self.disk.syncs} times')
+        for whose, disk in (('the recorder', self.disk), ('the checkpoints', self.checkpoints)):
+            if disk.room is not None:
+                lines.append(f'the disk of {whose} has room for {disk.room} bytes')
+            if disk.syncs is not None:
+                lines.append(f'the disk of {whose} syncs {disk.syncs} times')
+            if disk.kills_in is not None:
+                power = ', with the power of its machine' if disk.power else ''
+                lines.append(
+                    f'who writes to the disk of {whose} is killed in call {disk.kills_in}{power}'
+                )
         lines += [
             f'{death.name} is killed at {death.at:.1f} s for {death.seconds:.1f} s'
             f'{", and its machine loses its power" if death.power else ""}'
@@ -211,9 +229,18 @@ def plan(seed: int) -> Plan:
     unanswered = rng.uniform(0.01, 0.1) if some.happens(0.3) else 0.0
     weather = replace(weather, unanswered=unanswered)
     deaths = _deaths(rng, names) if some.happens(0.3) else ()
-    made = Plan(seed, settings, weather, paces, disk, False, leave_out_after, deaths)
+    checkpoints = Trouble()
+    if some.happens(0.05):
+        checkpoints.room = rng.randint(0, 60_000)
+    if some.happens(0.05):
+        checkpoints.syncs = rng.randint(0, 12)
+    for each, most in ((disk, 60), (checkpoints, 20)):
+        if some.happens(0.15):
+            each.kills_in, each.power = rng.randint(0, most), some.happens(0.5)
+    made = Plan(seed, settings, weather, paces, disk, False, leave_out_after, deaths, checkpoints)
     heals = (
-        disk == Trouble()
+        disk.mends
+        and checkpoints.mends
         and all(each.seconds <= LEASE for each in partitions)
         and made.silent < DEADLINE / 2
     )

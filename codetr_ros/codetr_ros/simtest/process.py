@@ -5,6 +5,7 @@ what is missing, work one slice, publish what came out.
 """
 
 from collections import Counter, defaultdict, deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Protocol
@@ -34,6 +35,7 @@ from codetr_ros.nodes.traffic import Traffic
 from codetr_ros.records import TOPICS, Commit, Presence, Record, RunSpec, describe
 from codetr_ros.records.roles import published_by
 from codetr_ros.simtest.asking import Asker, FetchAnswer, FetchRequest
+from codetr_ros.simtest.disks import KilledError
 from codetr_ros.simtest.network import KEPT_FOR_LATE
 from codetr_ros.simtest.world import World
 
@@ -138,6 +140,7 @@ class Process:
         killed: whether that was because it was killed.
         finished: whether its core was, when it ended.
         ended_at: when that was [s].
+        when_killed: called where that was within a call of its disk.
         repeated: second copies that it has taken, by topic.
         set_aside: messages that are fetched again later instead, by topic.
         lasting: packets that it has published on topics which keep them for late readers.
@@ -154,6 +157,7 @@ class Process:
         self.error: Exception | None = None
         self.over = self.ended = self.killed = self.finished = False
         self.ended_at = 0.0
+        self.when_killed: Callable[[Process], None] = lambda process: None
         self.repeated: Counter[str] = Counter()
         self.set_aside: Counter[str] = Counter()
         self.published: Counter[str] = Counter()
@@ -223,6 +227,10 @@ class Process:
             return
         try:
             pause = self._do_turn()
+        except KilledError:
+            self.die()
+            self.when_killed(self)
+            return
         except Exception as error:  # noqa: BLE001 - judged by the simulation, whatever it is
             self.error = error
             self.end()

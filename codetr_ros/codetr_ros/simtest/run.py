@@ -16,6 +16,7 @@ from codetr_ros.bags.definitions import decode
 from codetr_ros.bags.errors import BagError
 from codetr_ros.config import Settings
 from codetr_ros.cores import in_process
+from codetr_ros.cores.consumer import Consumer
 from codetr_ros.cores.core import Core
 from codetr_ros.cores.evaluator import Evaluator
 from codetr_ros.cores.labeller import Labeller
@@ -24,12 +25,13 @@ from codetr_ros.cores.recorder import Recorder
 from codetr_ros.cores.simulator import Simulator
 from codetr_ros.nodes import errors
 from codetr_ros.records import Commit, Record, RunSpec
-from codetr_ros.runs import checkpoint_names
+from codetr_ros.runs import checkpoints
 from codetr_ros.runs import folder as run_folder
+from codetr_ros.runs.checkpoints import CheckpointError, every, latest
 from codetr_ros.simtest import checks
-from codetr_ros.simtest.disks import TroubledDisk
+from codetr_ros.simtest.disks import KilledError, Trouble, TroubledDisk
 from codetr_ros.simtest.mail import Post
-from codetr_ros.simtest.plan import DEADLINE, Death, Plan, names_of, plan
+from codetr_ros.simtest.plan import BACK, DEADLINE, Death, Plan, names_of, plan
 from codetr_ros.simtest.process import Pace, Place, Process
 from codetr_ros.simtest.recording import Recording
 from codetr_ros.simtest.replay import replayed
@@ -120,14 +122,16 @@ class Simulated:
         self.failures: list[str] = []
         self._run = planned.settings.run_spec(RUN_ID)
         dying = {death.name for death in planned.deaths}
-        keeps = dying & {'reward', 'learner'}
+        keeps = dying & {'reward', 'learner'} or planned.checkpoints != Trouble()
+        self._checkpoint_disk = TroubledDisk(replace(planned.checkpoints))
+        self._torn: set[Path] = set()  # checkpoints that are damaged on purpose
         self._checkpoints = folder.parent / run_folder.CHECKPOINTS if keeps else None
+        self._dead = 0  # processes that will be there again
         self.processes: dict[str, Process] = {}
         self.post.processes = self.processes
         self.post.watch = self._watch
         for name, role in names_of(planned.settings).items():
             self._start(role, name, planned.paces[name])
-        self._dead = 0  # processes that will be there again
         for death in planned.deaths:
             self.world.at(death.at, partial(self._kill, death))
 
@@ -137,14 +141,20 @@ class Simulated:
             self.world, self.post, self._run, settings, role, name, pace, DEADLINE, instance
         )
         core = core_of(role, name, self._run, settings, self._checkpoints)
+        if isinstance(core, Consumer):
+            core.disk = self._checkpoint_disk
         made = self.processes[name] = (
             Recording(place, core, self.folder, self.disk, self.plan.leave_out_after)
             if role == 'record'
             else Process(place, core)
         )
+        made.when_killed = self._killed_within
         if isinstance(made, Recording):
             try:
                 made.open()
+            except KilledError:
+                made.die()
+                self._killed_within(made)
             except BagError as error:  # a disk that is full from the beginning
                 made.error = error
                 made.end()
@@ -157,9 +167,31 @@ class Simulated:
         killed.die()
         if death.power:
             self._lose_power(killed)
+        self._come_back(killed, death.seconds)
+
+    def _come_back(self, killed: Process, seconds: float) -> None:
         self._dead += 1
-        again = partial(self._start_again, killed)
-        self.world.at(self.world.now + death.seconds, again)
+        self.world.at(self.world.now + seconds, partial(self._start_again, killed))
+
+    def _killed_within(self, killed: Process) -> None:
+        """A process was killed within a call of its disk."""
+        disk = self.disk if isinstance(killed, Recording) else self._checkpoint_disk
+        disk.abandon()
+        if disk.trouble.power:
+            disk.lose_power(self.world.rng)
+            self._check_checkpoints()
+        self._come_back(killed, BACK)
+
+    def _check_checkpoints(self) -> None:
+        """A checkpoint that has its name outlasts a loss of power."""
+        if self._checkpoints is None or not self._checkpoints.is_dir():
+            return
+        there = [p for role in ('reward', 'learner') for p in every(self._checkpoints, role)]
+        for path in set(there) - self._torn:
+            try:
+                checkpoints.load(path)
+            except CheckpointError as error:
+                self.failures.append(f'a loss of power has damaged a checkpoint: {error}')
 
     def _lose_power(self, killed: Process) -> None:
         """Lose what a node has not synced; or have its newest checkpoint torn, which is worse."""
@@ -167,10 +199,11 @@ class Simulated:
         if isinstance(killed, Recording):
             self.disk.lose_power(rng)
         elif self._checkpoints is not None and killed.role in ('reward', 'learner'):
-            newest = checkpoint_names.latest(self._checkpoints, killed.role)
+            newest = latest(self._checkpoints, killed.role)
             if newest is not None:
                 file = rng.choice(sorted(newest.iterdir()))
                 os.truncate(file, rng.randint(0, file.stat().st_size - 1))
+                self._torn.add(newest)
                 self.world.note(killed.name, f'finds {newest.name} torn')
 
     def _start_again(self, killed: Process) -> None:

@@ -1,9 +1,11 @@
-"""The calls by which a recording reaches its disk: one place, where a disk can be simulated."""
+"""The calls by which bags and checkpoints reach their disk, so that it can be simulated."""
 
 import os
 import shutil
 from pathlib import Path
 from typing import BinaryIO
+
+from codetr_ros.system.files import write_synced
 
 
 class Disk:
@@ -17,6 +19,14 @@ class Disk:
         """
         return path.open('xb')
 
+    def write(self, path: Path, data: bytes) -> None:
+        """Write a whole file, and wait until it is on the disk.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        write_synced(path, data)
+
     def sync(self, file: BinaryIO) -> None:
         """Wait until all that was written to a file is on the disk.
 
@@ -27,7 +37,7 @@ class Disk:
         os.fsync(file.fileno())
 
     def replace(self, old: Path, new: Path) -> None:
-        """Let a file take the place of another one.
+        """Let a file or folder take the place of another one.
 
         Raises:
             OSError: it cannot.
