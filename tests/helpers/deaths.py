@@ -31,6 +31,7 @@ def deadly(planned: Plan, roles: Collection[str] = ROLES) -> Plan:
         paces=paces,
         weather=Weather(delay=0.02, reorder=True, doubled=0.1),
         disk=Trouble(),
+        checkpoints=Trouble(),
         heals=True,
         deaths=tuple(deaths),
     )

@@ -51,6 +51,8 @@ def leaving(
         paces=paces,
         weather=weather,
         disk=Trouble(),
+        checkpoints=Trouble(),
+        deaths=(),
         leave_out_after=3.0,
         heals=True,
     )

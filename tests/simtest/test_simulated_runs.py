@@ -37,7 +37,7 @@ def test_some_hundred_seeds_end_as_if_nothing_had_happened_or_by_name():
 
 
 def test_seeds_draw_every_kind_of_run_and_every_kind_of_trouble():
-    plans = [plan(seed) for seed in MANY]
+    plans = [plan(seed) for seed in range(24, 300)]
     assert {each.settings.hash() for each in plans} == {s.hash() for s in all_settings()}
     for happens in (
         lambda p: p.weather.doubled,
@@ -71,7 +71,9 @@ def test_a_run_that_cannot_be_mended_ends_by_errors_that_name_a_cause():
 def test_a_wait_that_nobody_can_end_ends_at_the_deadline_and_names_who_waits_for_what():
     seed = next(i for i, each in enumerate(all_settings()) if each.method == 'rrd')
     calm = Weather(delay=0.01, overrun=0.2, unanswered=1.0)
-    planned = replace(plan(seed), weather=calm, disk=Trouble(), heals=False)
+    planned = replace(
+        plan(seed), weather=calm, disk=Trouble(), checkpoints=Trouble(), deaths=(), heals=False
+    )
     ended = carry_out(replace(planned, paces=dict.fromkeys(planned.paces, Pace())))
     assert ended.failures == []
     assert set(ended.errors) == set(planned.paces)

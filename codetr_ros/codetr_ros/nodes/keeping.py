@@ -108,6 +108,7 @@ class Keeping:
         self._beside = Beside(keeper.run, keeper.settings, lambda: keeper.core.phase)
         self._unannounced = Early(keeper.settings)
         self._catches_up_until = 0.0  # [s, monotonic]
+        self._missed_until = 0.0  # as long it does not end before others have sent what it missed
         self.early: Counter[str] = Counter()
         # the newest of each publisher that came while something before it was lacking
         self._early: dict[object, Record] = {}
@@ -144,6 +145,7 @@ class Keeping:
         if self._bag.gone_on:
             self._by.begin_counting_anew()
             self._sweeper.ask(self._nodes())
+            self._missed_until = self._by.clock() + CATCH_UP
 
     def _nodes(self, roles: Collection[str] = ROLES) -> list[str]:
         """Full names of the other nodes of these roles."""
@@ -328,6 +330,9 @@ class Keeping:
         settled, doing = self._settling.check(missing, seconds, self._by.clock())
         if not settled:
             self._ask_again(missing)
+        elif self._sweeper.busy and self._by.clock() < self._missed_until:
+            self._sweeper.check()
+            return False, 'waits for what others have published while it was away'
         elif self.without:
             self._log.warning(
                 f'ends without {", ".join(self.without)}: what was still to come from there is '
