@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from codetr_ros.cores.beside import Beside
+from codetr_ros.cores.left_out import voided
 from codetr_ros.records import RecordError, TrueRewards
-from helpers.builders import run, tiny
+from helpers.builders import commit, run, tiny
 
 SETTINGS = tiny()
 
@@ -40,3 +41,19 @@ def test_true_rewards_may_be_late_by_any_number_of_phases():
     assert beside.duplicated == {'true_rewards': 1}
     with pytest.raises(RecordError, match='phase must be from 0 to 5'):
         beside.receive(true_rewards(3, 6))
+
+
+def test_true_rewards_are_taken_of_a_source_that_was_left_out_of_phases_one_after_the_other():
+    """With overlap, two phases are permitted: each commit voids numbers of both."""
+    settings = SETTINGS.changed({'overlap': True, 'simulators': 2})
+    beside, due = Beside(run(settings), settings, lambda: 4), 1
+    beside.receive(true_rewards(0, 0))
+    for phase in (1, 2):
+        last = voided(settings, due)
+        beside.receive(commit(phase=phase, transitions=np.array([last]), dropped=('sim',)))
+        due = last + 1
+    with pytest.raises(RecordError, match='sequence must be from'):
+        beside.receive(true_rewards(due + 1000, 4))
+    for sequence in (due, 1):  # the second was under way when its source was left out
+        beside.receive(true_rewards(sequence, 4))
+    assert beside.duplicated == {}

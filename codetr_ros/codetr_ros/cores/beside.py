@@ -9,6 +9,7 @@ from codetr_ros.config import Settings
 from codetr_ros.cores.announced import EARLY_BYTES
 from codetr_ros.records import (
     TOPICS,
+    Commit,
     CompositeReward,
     EpisodeResult,
     Metrics,
@@ -19,6 +20,7 @@ from codetr_ros.records import (
     TrueRewards,
     describe,
 )
+from codetr_ros.records.chain import named, void
 from codetr_ros.records.checks import check_run
 
 MOST_LACKING = 100_000
@@ -86,7 +88,7 @@ class Beside:
         self.duplicated: Counter[str] = Counter()
 
     def receive(self, record: Record) -> None:
-        """Check a record.
+        """Check a record, or take note of a commit.
 
         Raises:
             RecordError: it must be refused; nothing has changed then.
@@ -100,12 +102,24 @@ class Beside:
         elif isinstance(record, Metrics):
             self._within(record, record.phase, -1, self._settings.phases - 1, 'phase')
             self._within(record, record.step, 0, self._settings.steps, 'step')
+        elif isinstance(record, Commit):
+            for kind, source in void(record):
+                if kind is Transitions:
+                    self._pass_over(source, named(record)[kind, source])
 
     def _within(self, record: Record, value: int, least: int, most: int, name: str) -> None:
         if not least <= value <= most:
             raise RecordError(
                 f'{describe(record)}: {name} must be from {least} to {most} in this run'
             )
+
+    def _pass_over(self, source: str, last: int) -> None:
+        """Go on behind the numbers that a commit voids of a source; some may still come."""
+        lacking, due = self._lacking[source], self._due[source]
+        lacking.update(range(due, last + 1))
+        while len(lacking) > MOST_LACKING:
+            lacking.remove(min(lacking))
+        self._due[source] = max(due, last + 1)
 
     def _true_rewards(self, record: TrueRewards) -> None:
         settings, due = self._settings, self._due[record.source]
@@ -122,7 +136,5 @@ class Beside:
             return
         most = due + (settings.ahead + 1) * settings.phase_steps
         self._within(record, record.sequence, due, most, 'sequence')
-        lacking.update(range(due, record.sequence))
-        while len(lacking) > MOST_LACKING:
-            lacking.remove(min(lacking))
+        self._pass_over(record.source, record.sequence - 1)
         self._due[record.source] = record.sequence + 1

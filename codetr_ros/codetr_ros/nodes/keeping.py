@@ -247,6 +247,8 @@ class Keeping:
             raw: its message.
             published: when it was published [ns].
         """
+        if isinstance(record, Commit):
+            self._beside.receive(record)
         self._bag.write(record, raw, self._by.stamp(), published)
 
     # ---- what is lacking
