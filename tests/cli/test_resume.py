@@ -5,12 +5,14 @@ import json
 import os
 import random
 import re
+import shutil
 from pathlib import Path
 
 import pytest
 
 from codetr_ros.bags.verify import verify
 from codetr_ros.cli import train
+from codetr_ros.processes import launcher
 from codetr_ros.runs import origin
 from codetr_ros.runs.origin import held
 from helpers.builders import tiny
@@ -129,7 +131,45 @@ def test_a_folder_that_is_no_run_or_of_another_version_is_refused(run, tmp_path,
     assert 'was made with --no-bag' in capsys.readouterr().err
 
 
-def test_a_run_that_is_under_way_is_left_alone(run, capsys):
+@pytest.mark.parametrize('text', ['steps: [}', 'steps: -3', ''])
+def test_damaged_settings_are_refused_with_the_remedy(text, run, tmp_path, capsys):
+    (tmp_path / 'config.yaml').write_text(text)
+    (tmp_path / 'run.json').write_text((run / 'run.json').read_text())
+    assert train.main(['--resume', str(tmp_path)]) == 2
+    refused = capsys.readouterr().err
+    assert f'{tmp_path}/config.yaml' in refused
+    assert 'restore config.yaml from a copy, or start the run again' in refused
+
+
+def test_what_can_be_made_again_may_be_gone_or_damaged(run, tmp_path):
+    folder = tmp_path / 'run'
+    shutil.copytree(run, folder)
+    for name in ('logs', 'nodes'):
+        shutil.rmtree(folder / name)
+    for name in ('metrics.csv', 'report.html', 'status.json', 'bag/metadata.yaml'):
+        (folder / name).unlink()
+    (folder / 'summary.json').write_text('{')
+    flags = ('--resume', str(folder), '--steps', '600', '--no-film')
+    summary, said = finish(codetr('train', *flags, environment=ENVIRONMENT), folder)
+    assert summary['steps'] == 600
+    assert 'summary.json is not JSON' in said
+    assert 'it is made again' in said
+    assert verify(folder / 'bag').sound
+
+
+def test_a_file_in_the_place_of_a_folder_is_named(run, tmp_path, capsys):
+    folder = tmp_path / 'run'
+    shutil.copytree(run, folder)
+    shutil.rmtree(folder / 'logs')
+    (folder / 'logs').write_text('mine')
+    assert train.main(['--resume', str(folder), '--steps', '600', '--no-film']) == 2
+    assert f'folder {folder}/logs cannot be made (File exists): remove' in ' '.join(
+        capsys.readouterr().err.split()
+    )
+
+
+def test_a_run_that_is_under_way_is_left_alone(run, capsys, monkeypatch):
+    monkeypatch.setattr(launcher, 'STOP_DEADLINE', 0.3)  # for nodes that are ending
     with held(run):
         assert train.main(['--resume', str(run), '--steps', '600', '--no-film']) == 2
     assert 'is under way in another process' in capsys.readouterr().err

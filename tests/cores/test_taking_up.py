@@ -201,7 +201,14 @@ def test_checkpoints_that_fit_no_bag_or_no_learner_are_removed_before_nodes_go_o
     assert f'the learner goes on from phase {learnt}, and needs all labels since' in caplog.text
 
     (bag,) = (folder / 'bag').glob('*.mcap')
-    bag.write_bytes(bag.read_bytes()[:3000])
+    sound = bag.read_bytes()
+    bag.write_bytes(sound[:9000] + b'\xff' * 8 + sound[9008:])
+    with pytest.raises(BagError, match='a commit lies behind it'):
+        for_nodes(settings, 'run', folder)
+    assert checkpoints.latest(where, 'learner') == newest
+
+    bag.write_bytes(sound[:3000])
+    (folder / 'bag' / 'metadata.yaml').touch()  # the recorder would take it for another bag's
     for_nodes(settings, 'run', folder)
-    assert list(where.iterdir()) == []
+    assert list(where.iterdir()) == list((folder / 'bag').iterdir()) == []
     assert 'no phase was committed: the run begins from its start' in caplog.text

@@ -12,9 +12,11 @@ pytest.importorskip('rclpy', reason='needs ROS')
 
 from kills import phase_of
 
+from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.verify import verify
 from codetr_ros.cores import in_process
-from codetr_ros.ros.membership import KEPT_PHASES
+from codetr_ros.nodes.outbox import KEPT_PHASES
+from codetr_ros.offline.replay import replay
 from codetr_ros.runs import origin
 from helpers.builders import tiny
 from helpers.forked import codetr
@@ -63,6 +65,8 @@ def test_a_run_all_of_which_is_killed_goes_on_and_gets_longer_and_has_the_same_w
     assert verify(folder / 'bag').sound
     assert summary['evaluations_missing'] == 0
 
+    for name in ('logs', 'nodes'):
+        shutil.rmtree(folder / name)  # they are made again
     longer = settings.changed({'steps': 2400})
     summary = resumed(folder, '--steps', '2400')
     assert weights(summary) == digests(longer)
@@ -70,6 +74,33 @@ def test_a_run_all_of_which_is_killed_goes_on_and_gets_longer_and_has_the_same_w
     assert verify(folder / 'bag').sound
     assert summary['evaluations_missing'] == 0
     assert json.loads((folder / 'summary.json').read_text())['settings']['steps'] == 2400
+
+
+@pytest.mark.slow
+def test_a_run_from_which_a_simulator_was_left_out_goes_on_and_gets_longer(tmp_path):
+    """Its weights are those that learn again from what was recorded."""
+    changes = {
+        'overlap': True, 'simulators': 2, 'steps': 1500, 'phase_steps': 100, 'evaluate_every': 0,
+    }  # fmt: skip
+    folder = tmp_path / 'run'
+    command = start(write(SETTINGS.changed(changes), folder), folder, '--leave-out-after', '2')
+    until(lambda: phase_of(folder) >= 3, command, folder)
+    os.kill(node_of(folder, 'sim_2'), signal.SIGSTOP)
+    log = folder / 'logs' / 'record.log'
+    until(lambda: 'sim_2 is left out of phase' in log.read_text(), command, folder)
+    kill(command, folder)
+    for steps in (1500, 2000):
+        summary = resumed(folder, '--steps', str(steps))
+        assert summary['steps'] == steps
+        assert verify(folder / 'bag').sound
+        again = replay(Bag(folder / 'bag'), folder / 'checkpoints')
+        assert (again.first, again.phases) == (None, steps // 100)
+        learnt = again.reports
+        assert weights(summary) == [
+            learnt['learner'].policy_sha256,
+            learnt['reward'].reward_model_sha256,
+        ]
+    assert summary['left_out']['sim_2'] >= 1
 
 
 @pytest.mark.slow

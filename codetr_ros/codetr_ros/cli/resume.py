@@ -5,11 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from codetr_ros import config
-from codetr_ros.config import Settings
+from codetr_ros.config import Settings, SettingsError
+from codetr_ros.runs import facts, origin
 from codetr_ros.runs import folder as run_folder
-from codetr_ros.runs import origin, run_summary
 from codetr_ros.runs.folder import RunFolderError
 from codetr_ros.runs.origin import Origin
+from codetr_ros.runs.run_summary import RunSummary
 from codetr_ros.system.versions import version_of
 
 FLAG = '--resume'
@@ -40,8 +41,23 @@ def with_settings(arguments: Sequence[str]) -> list[str]:
         raise RunFolderError(
             f'{FLAG} {folder} goes on with the settings of the run: leave out --config'
         )
-    run_folder.read_settings(Path(folder))  # refuses what is no folder of a run
+    _settings_of(Path(folder))
     return [*arguments, '--config', str(Path(folder) / run_folder.CONFIG)]
+
+
+def _settings_of(folder: Path) -> Settings:
+    """The settings of a run.
+
+    Raises:
+        RunFolderError: it is no folder of a run, or its settings are refused.
+    """
+    try:
+        return run_folder.read_settings(folder)
+    except SettingsError as error:
+        raise RunFolderError(
+            f'{error}. A run goes on with the settings that it began with: restore '
+            f'{run_folder.CONFIG} from a copy, or start the run again'
+        ) from error
 
 
 def check(folder: Path, settings: Settings, extra: Mapping[str, Any]) -> Origin:
@@ -57,9 +73,8 @@ def check(folder: Path, settings: Settings, extra: Mapping[str, Any]) -> Origin:
 
     Raises:
         RunFolderError: it cannot: names the reason and the remedy.
-        SettingsError: its own settings cannot be read.
     """
-    before = run_folder.read_settings(folder)
+    before = _settings_of(folder)
     made = origin.read(folder)
     for name, default in OF_NEW_RUNS.items():
         if extra[name] != default:
@@ -106,12 +121,22 @@ def _check_settings(folder: Path, before: Settings, settings: Settings) -> None:
 
 
 def _finished(folder: Path, settings: Settings) -> bool:
-    path = folder / run_folder.SUMMARY
-    if not path.is_file():
+    summary, _ = _summary(folder)
+    if summary is None:
         return False
-    summary = run_summary.read(path)
     over = not summary.interrupted and summary.failure is None
     return over and summary.steps >= settings.steps
+
+
+def _summary(folder: Path) -> tuple[RunSummary | None, str]:
+    """The summary of a run, or why it cannot be read, in words; neither where there is none."""
+    path = folder / run_folder.SUMMARY
+    if not path.is_file():
+        return None, ''
+    try:
+        return facts.read(RunSummary, path, 'summary', 'it is made again'), ''
+    except RunFolderError as error:
+        return None, str(error)
 
 
 def prepare(settings: Settings, run_id: str, folder: Path) -> list[str]:
@@ -139,11 +164,19 @@ def begin(folder: Path, made: Origin, settings: Settings) -> list[str]:
         folder: of the run.
         made: how it was begun.
         settings: under which it goes on.
+
+    Raises:
+        RunFolderError: a file is in the place of one of its folders.
+        OSError: it cannot be written.
     """
     settings = config.settled(settings)
+    run_folder.make_again(folder)
     run_folder.write_settings(folder, settings)
     origin.gone_on_with(folder, made)
-    other = origin.differences(made, settings)
-    if not other:
-        return []
-    return [f'the run was begun with {"; ".join(other)}: the last bits of weights may differ']
+    _, damaged = _summary(folder)
+    notes = [damaged] if damaged else []
+    if other := origin.differences(made, settings):
+        notes.append(
+            f'the run was begun with {"; ".join(other)}: the last bits of weights may differ'
+        )
+    return notes

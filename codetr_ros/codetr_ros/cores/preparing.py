@@ -8,8 +8,9 @@ from pathlib import Path
 
 from codetr_ros.bags.cutting import Cut, announced, cut
 from codetr_ros.bags.errors import BagError
+from codetr_ros.bags.metadata import METADATA
 from codetr_ros.bags.reader import Bag
-from codetr_ros.bags.reopening import holds_messages
+from codetr_ros.bags.reopening import holds_messages, mend
 from codetr_ros.config import Settings, from_canonical, settled
 from codetr_ros.cores import going_on
 from codetr_ros.records import Commit, RunSpec
@@ -40,10 +41,12 @@ def for_nodes(
         OSError: it cannot be written.
     """
     settings, bag = settled(settings), folder / run_folder.BAG
-    before = announced(bag)
     check_not_lost(bag, folder)
+    if holds_messages(bag):
+        mend(bag)
+    before = announced(bag)
     if before is None:
-        forget_checkpoints(folder, log)
+        begin_again(folder, log)
         return
     check(before, settings, run_id, bag)
     known = from_canonical(before.settings, str(bag))
@@ -126,6 +129,15 @@ def cut_back(
             + (f'; what came behind it is made again: {gone}' if gone else '')
         )
     return made
+
+
+def begin_again(folder: Path, log: Callable[[str], None]) -> None:
+    """Remove bag and checkpoints of a run of which nothing has been learnt from."""
+    bag = folder / run_folder.BAG
+    for path in sorted(bag.iterdir()) if bag.is_dir() else ():
+        if path.suffix == '.mcap' or path.name == METADATA:
+            path.unlink()
+    forget_checkpoints(folder, log)
 
 
 def forget_checkpoints(folder: Path, log: Callable[[str], None]) -> None:

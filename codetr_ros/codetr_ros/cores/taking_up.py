@@ -154,9 +154,7 @@ class _Past:
 
     def _begin_again(self, bag: Path) -> None:
         """Begin from the start in the same folder: nothing has been learnt from."""
-        for path in sorted(bag.iterdir()) if bag.is_dir() else ():
-            path.unlink()
-        preparing.forget_checkpoints(self._folder, self._log)
+        preparing.begin_again(self._folder, self._log)
         assert all(consumer.phase == 0 for consumer in self._consumers.values())
         self._parts.bag = RunBag(bag, self._parts.settings, namespace_of(self._parts.spec.run_id))
         self._parts.announce()

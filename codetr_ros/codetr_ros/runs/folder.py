@@ -29,6 +29,9 @@ TENSORBOARD = 'tensorboard'
 ROBOTS = 'robots'
 POLICY = 'policy.safetensors'
 
+EVERY = (NODES, LOGS, CHECKPOINTS)
+"""The folders in it that every run has from its beginning on."""
+
 
 class RunFolderError(ValueError):
     """A folder that cannot hold a run, or holds none: the message names it and the remedy."""
@@ -72,7 +75,7 @@ def create(path: Path) -> Path:
     check(path)
     folder = path.absolute()
     try:
-        for name in (NODES, LOGS, CHECKPOINTS):
+        for name in EVERY:
             (folder / name).mkdir(parents=True)
     except FileExistsError as error:  # since it was checked
         raise RunFolderError(
@@ -83,6 +86,22 @@ def create(path: Path) -> Path:
             f'output folder {path} cannot be made ({error.strerror}): choose another with --out'
         ) from error
     return folder
+
+
+def make_again(folder: Path) -> None:
+    """Make those of the folders that every run has which are gone.
+
+    Raises:
+        RunFolderError: a file is in the place of one, or it cannot be made.
+    """
+    for name in EVERY:
+        try:
+            (folder / name).mkdir(exist_ok=True)
+        except OSError as error:
+            raise RunFolderError(
+                f'folder {folder / name} cannot be made ({error.strerror}): remove what is there, '
+                'or make room'
+            ) from error
 
 
 def create_next(path: Path) -> Path:
