@@ -10,9 +10,11 @@ from launch import LaunchContext, LaunchDescription, LaunchService
 from launch.actions import EmitEvent, ExecuteProcess, RegisterEventHandler
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
+from launch.utilities import perform_substitutions
 from launch_ros.actions import Node
 
 from codetr_ros.config import USUAL, SettingsError
+from codetr_ros.nodes.signing import VARIABLE, key_of
 from helpers.launching import launch_file, parameters
 
 
@@ -23,17 +25,29 @@ def module():
 
 
 @pytest.fixture
-def started(module, tmp_path):
-    """Package and executable of each node that the launch file starts under some settings."""
+def context(module, tmp_path):
+    """Makes the context of a launch: settings in lines, and arguments by name."""
 
-    def start(*lines, **given):
+    def make(*lines, **given):
         config = tmp_path / 'config.yaml'
         config.write_text('\n'.join(lines or ['seed: 0']) + '\n')
-        context = LaunchContext()
+        made = LaunchContext()
         for argument in module.generate_launch_description().get_launch_arguments():
             default = ''.join(part.text for part in argument.default_value)
-            context.launch_configurations[argument.name] = default
-        context.launch_configurations.update({'config': str(config)} | given)
+            made.launch_configurations[argument.name] = default
+        made.launch_configurations.update({'config': str(config)} | given)
+        return made
+
+    return make
+
+
+@pytest.fixture
+def started(module, context):
+    """Package and executable of each node that the launch file starts under some settings."""
+    make = context
+
+    def start(*lines, **given):
+        context = make(*lines, **given)
         nodes = [made for made in module.nodes(context) if isinstance(made, Node)]
         if given:
             return {node._Node__node_name: parameters(node, context) for node in nodes}
@@ -50,6 +64,38 @@ def test_all_nodes_of_a_run_are_started(started):
         ('sim_node', 'evaluate'),
         ('sim_node', 'sim'),
     ]
+
+
+@pytest.fixture
+def keys(module, context):
+    """The key of the run that each node is handed, by its name."""
+
+    def read():
+        made = context()
+        found = {}
+        for node in (each for each in module.nodes(made) if isinstance(each, Node)):
+            handed = {
+                perform_substitutions(made, name): perform_substitutions(made, value)
+                for name, value in node.process_description.additional_env
+            }
+            found[node._Node__node_name] = key_of(handed)
+        return found
+
+    return read
+
+
+def test_all_nodes_of_a_launch_are_handed_one_key_and_each_launch_makes_its_own(keys, monkeypatch):
+    monkeypatch.delenv(VARIABLE, raising=False)
+    first, second = keys(), keys()
+    assert set(first) == {'sim', 'evaluate', 'record', 'reward', 'learner'}
+    assert len(set(first.values())) == len(set(second.values())) == 1
+    assert None not in first.values()
+    assert first['sim'] != second['sim']
+
+
+def test_the_key_that_is_there_is_handed_on_so_that_others_can_take_part(keys, monkeypatch):
+    monkeypatch.setenv(VARIABLE, '5a' * 32)
+    assert set(keys().values()) == {b'\x5a' * 32}
 
 
 def test_nodes_that_a_run_does_not_need_are_not_started(started):
