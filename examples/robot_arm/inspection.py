@@ -5,23 +5,29 @@
 It receives the steps of the run and looks at where the hand was. For each segment that is over it
 publishes one number, how near the hand was to the target on the whole, some seconds later. Some
 segments it never scores. What was lost on the way, because the recorder was started again, it
-publishes once more.
+publishes once more. Started again itself, it goes on behind its last number.
 """
 
 import argparse
 import sys
 import time
 from collections import defaultdict
+from collections.abc import Callable
 
 import numpy as np
 import rclpy
 from arm import nearness
 from codetr_msgs import msg
+from codetr_msgs.srv import FetchPhase
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
+from codetr_ros.bags.definitions import decode
 from codetr_ros.config import Settings, from_canonical
+from codetr_ros.records import Commit, CompositeReward
+from codetr_ros.records.fields import type_name
 from codetr_ros.ros import qos
+from codetr_ros.ros.fetch import unpack
 from codetr_ros.ros.signing import Signed
 
 
@@ -42,7 +48,9 @@ class Inspection(Node):
         self._steps: defaultdict[int, list[float]] = defaultdict(list)  # nearness, by episode
         self._scored: defaultdict[int, int] = defaultdict(int)  # steps that have had their score
         self._waiting: list[tuple[float, msg.CompositeReward]] = []  # in order of their time
-        self._sequence = self.skipped = 0
+        self._sequence = self.skipped = self.missed = 0
+        self._known = False  # whether _sequence is behind all that the recorder has
+        self._ask_again = 0.0  # when
         self._open: list[msg.CompositeReward] = []  # that no commit has named
         self._before = 0  # scores that had been published when the last commit came
         self.create_subscription(msg.RunSpec, 'run', self._run, qos.profile('run'))
@@ -53,6 +61,7 @@ class Inspection(Node):
             return
         settings = self._settings = from_canonical(run.settings, 'the run')
         self._run_id = run.run_id
+        self._recorder = self.create_client(FetchPhase, 'fetch_phase')
         topic = 'composite_rewards'
         self._publish_score = Signed(  # with the key of the run, where there is one
             self, msg.CompositeReward, topic, qos.profile(topic, settings)
@@ -63,6 +72,43 @@ class Inspection(Node):
         self.create_subscription(
             msg.Commit, 'commits', self._committed, qos.profile('commits', settings)
         )
+
+    def _go_on(self) -> None:
+        """Ask the recorder for the scores that a process of this name has published before: the
+        next one gets the number behind them. A number that comes twice is dropped.
+        """
+        now = time.monotonic()
+        if now < self._ask_again or not self._recorder.service_is_ready():
+            return
+        self._ask_again = now + 5.0
+        self._ask(FetchPhase.Request.NEWEST, Commit, self._newest)
+
+    def _ask(self, phase: int, kind: type, answered: Callable[..., None]) -> None:
+        request = FetchPhase.Request(
+            run_id=self._run_id,
+            phase=phase,
+            requester=self.get_fully_qualified_name(),
+            kinds=[type_name(kind)],
+        )
+        future = self._recorder.call_async(request)
+        future.add_done_callback(lambda done: answered(done.result()))
+
+    def _newest(self, answer: FetchPhase.Response) -> None:
+        for _, data in unpack(answer):
+            self._number_behind(decode(Commit, data))
+        phase = answer.phase + 1 if answer.found else 0
+        self._ask(phase, CompositeReward, self._under_way)
+
+    def _number_behind(self, commit: Commit) -> None:
+        if self.get_name() in commit.scorers:
+            last = int(commit.scores[commit.scorers.index(self.get_name())])
+            self._sequence = max(self._sequence, last + 1)
+
+    def _under_way(self, answer: FetchPhase.Response) -> None:
+        scores = [decode(CompositeReward, data) for _, data in unpack(answer)]
+        own = [score.sequence for score in scores if score.scorer == self.get_name()]
+        self._sequence = self._before = max([self._sequence - 1, *own]) + 1
+        self._known = True
 
     def _committed(self, commit: msg.Commit) -> None:
         """A commit names what has reached the recorder: publish again what was lost before."""
@@ -78,6 +124,10 @@ class Inspection(Node):
         assert settings is not None
         seen = np.asarray(steps.observations, np.float64).reshape(steps.steps + 1, -1)
         near = self._steps[steps.episode]
+        if steps.first_step != len(near):  # it was not there when the episode began
+            del self._steps[steps.episode]
+            self.missed += 1
+            return
         near += nearness(seen[1:, :2]).tolist()  # the first two are shoulder and elbow
         over = steps.terminated or steps.truncated
         length = settings.lengths.most or len(near)
@@ -106,6 +156,10 @@ class Inspection(Node):
 
     def _publish(self) -> None:
         """Publish the scores whose time has come, numbered in the order in which they go out."""
+        if not self._known:
+            if self._settings is not None:
+                self._go_on()
+            return
         now = time.monotonic()
         for due, score in [each for each in self._waiting if each[0] <= now]:
             self._waiting.remove((due, score))

@@ -11,7 +11,7 @@ from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.reopening import reopen
 from codetr_ros.bags.verify import verify
 from codetr_ros.bags.writer import McapWriter
-from codetr_ros.records import TOPICS, Commit, Policy
+from codetr_ros.records import TOPICS, Commit, Policy, Transitions
 from codetr_ros.records.fields import type_name
 from helpers.bags import a_run, own_topics
 from helpers.builders import policy
@@ -134,6 +134,27 @@ def test_a_closed_bag_is_gone_on_with_in_a_new_file(tmp_path):
     writer.close()
     assert [path.name for path in Bag(tmp_path / 'bag').files] == ['bag_0.mcap', 'bag_1.mcap']
     assert len(contents(tmp_path / 'bag')) == len(a_run()) + 1
+
+
+def test_a_phase_that_goes_on_in_the_next_file_is_read_from_both(tmp_path):
+    """All nodes were stopped in the midst of a phase; or a file became too large there."""
+    folder, records = tmp_path / 'bag', a_run()
+    cut = next(i for i, r in enumerate(records) if getattr(r, 'sequence', -1) == 5)  # of phase 1
+    writer = McapWriter(folder, own_topics(), chunk_bytes=1000)
+    write(writer, records[:cut])
+    writer.close()
+    phases = Phases()
+    written = reopen(folder, lambda raw: phases.note(Bag(folder).entry(raw).record, raw.place))
+    writer = McapWriter(folder, own_topics(), chunk_bytes=1000, written=written)
+    write(writer, records[cut:], phases)
+    wanted = [
+        raw_of(record)
+        for record in records
+        if getattr(record, 'phase', 1) == 1 and type(record) in (Transitions, Commit)
+    ]
+    assert [
+        raw for _, raw in phases.read(1, [type_name(Transitions), type_name(Commit)])
+    ] == wanted
 
 
 def test_damage_before_a_commit_is_refused_and_changes_nothing(killed, tmp_path):

@@ -1,6 +1,8 @@
-"""Nodes of a run on a robot are killed while it moves, and started again: the run goes on, and its
-bag teaches the same weights.
+"""Nodes of a run on a robot are killed while it moves, and started again; then all of them are
+stopped, as for the night. The run goes on each time, and its bag teaches the same weights.
 """
+
+import signal
 
 import pytest
 
@@ -22,7 +24,7 @@ def _domain():
         yield
 
 
-def test_a_run_ends_well_and_is_replayed_though_its_robot_node_and_its_recorder_were_killed(
+def test_a_run_ends_well_and_is_replayed_though_its_nodes_were_killed_and_all_of_them_stopped(
     tmp_path,
 ):
     settings = robot_settings(steps=240, scorers=('robot', 'inspection'))
@@ -37,6 +39,15 @@ def test_a_run_ends_well_and_is_replayed_though_its_robot_node_and_its_recorder_
             person.until(lambda: person.committed(1))
             run.kill('record')
             person.until(lambda: 'goes on with' in run.log('record'))
+            person.until(lambda: person.committed(2))
+            person.ticks(15)
+            for name in ('inspection', *ROLES):
+                run.end(name, signal.SIGINT)
+        ended = run.wait('inspection', *ROLES)
+        assert {ended[name] for name in ROLES} == {0}
+        before = scores(folder, 'inspection')
+        run.inspect()
+        run.again(*ROLES)
         codes = run.wait(*ROLES)
         assert {codes[name] for name in ROLES} == {0}, run.log('robot')
         assert run.report('robot')['counters']['times that the node was started again'] == 1
@@ -46,10 +57,19 @@ def test_a_run_ends_well_and_is_replayed_though_its_robot_node_and_its_recorder_
     chunks = [record for record in records if isinstance(record, Transitions)]
     assert sum(chunk.steps for chunk in chunks) == settings.steps
     assert [chunk.sequence for chunk in chunks] == list(range(len(chunks)))
-    own = [r.sequence for r in records if isinstance(r, CompositeReward) and r.scorer == 'robot']
+    own = scores(folder, 'robot')
     # each of them once; what the recorder missed while it was dead comes behind newer ones
     assert sorted(own) == list(range(len(own))) and len(own) > 3
+    inspected = scores(folder, 'inspection')
+    assert len(inspected) >= len(before) > 0
+    assert inspected == list(range(len(inspected))), 'a scorer goes on behind its last number'
     labelled = [record.phase for record in records if isinstance(record, StepRewards)]
     assert labelled == sorted(labelled)
     assert set(labelled) == set(range(settings.first_labelled, settings.phases))
     assert cli.main(['replay', str(folder), '--verify']) == 0
+
+
+def scores(folder, scorer):
+    """The numbers of a scorer's scores, in the order of the bag."""
+    entries = Bag(folder / run_folder.BAG).entries((CompositeReward,))
+    return [entry.record.sequence for entry in entries if entry.record.scorer == scorer]

@@ -89,10 +89,14 @@ class RobotRun(nodes.Nodes):
         """Start the arm, the inspection and the nodes; `others` are arguments of the arm."""
         self.start_other('arm', 'stand_in.py', '--log', str(self.folder / 'truth.jsonl'), *others)
         if inspection:
-            ros = ('--ros-args', '-r', f'__ns:={nodes.NAMESPACE}')
-            self.start_other('inspection', 'inspection.py', '--late', '0.5', *ros)
+            self.inspect()
         for name in self.names:
             self.start(name)
+
+    def inspect(self) -> None:
+        """Start the inspection."""
+        ros = ('--ros-args', '-r', f'__ns:={nodes.NAMESPACE}')
+        self.start_other('inspection', 'inspection.py', '--late', '0.5', *ros)
 
     def start_other(self, name: str, script: str, *arguments: str) -> None:
         """Start a process that is none of this project's."""
@@ -117,6 +121,13 @@ class RobotRun(nodes.Nodes):
         os.kill(node.process.pid, signal.SIGKILL)
         node.process.wait(nodes.PATIENCE)
         self._processes.start_again(node)
+
+    def again(self, *names: str) -> None:
+        """Start nodes of the run again that have ended, with what they had."""
+        for node in self._processes.nodes:
+            if node.name in names:
+                node.process.wait(nodes.PATIENCE)
+                self._processes.start_again(node)
 
     def end(self, name: str, number: signal.Signals) -> None:
         """Send a signal to one process."""
