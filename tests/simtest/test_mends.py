@@ -27,7 +27,7 @@ from codetr_ros.runs import checkpoints
 from codetr_ros.simtest import disks, process
 from codetr_ros.simtest.disks import Trouble
 from codetr_ros.simtest.network import Weather
-from codetr_ros.simtest.plan import all_settings, plan
+from codetr_ros.simtest.plan import Death, all_settings, plan
 from codetr_ros.simtest.process import Pace
 from codetr_ros.simtest.run import carry_out, undisturbed
 from helpers.deaths import deadly
@@ -269,6 +269,19 @@ def name_a_checkpoint_before_it_is_on_the_disk(patch):
     patch.setattr(disks.TroubledDisk, 'write', write)
 
 
+def end_before_what_was_missed_is_there(patch):
+    def go_on(self):
+        real(self)
+        self._missed_until = 0.0
+
+    real = keeping.Keeping.go_on
+    patch.setattr(keeping.Keeping, 'go_on', go_on)
+
+
+def ask_only_for_what_is_counted(patch):
+    patch.setattr(keeping.Keeping, '_nobody_works', lambda self: False)
+
+
 def forget_what_was_published(patch):
     def read(self, phase, kinds=()):
         raise KeyError(f'phase {phase} is not kept')
@@ -311,6 +324,8 @@ MENDS: dict[Callable, str] = {
     begin_from_the_start: 'gave up|other weights|stuck|not sound|fault',
     go_on_from_a_torn_checkpoint: 'gave up',
     forget_what_was_published: 'gave up|not sound',
+    end_before_what_was_missed_is_there: 'gave up|not sound',
+    ask_only_for_what_is_counted: 'gave up',
     name_a_checkpoint_before_it_is_on_the_disk: 'has damaged a checkpoint',
 }
 
@@ -345,6 +360,19 @@ def cut_off(planned):
     )
 
 
+def killed_at_the_end(planned):
+    """The same run, but that its recorder is killed late."""
+    deaths = (Death('record', 2.5 + planned.seed % 16, 6.0),)
+    paces = dict.fromkeys(planned.paces, Pace(slice_seconds=0.2))
+    planned = replace(planned, paces=paces, weather=Weather(delay=0.3), disk=Trouble())
+    return replace(planned, deaths=deaths, checkpoints=Trouble(), heals=True)
+
+
+def lost_and_killed(planned):
+    """A run in which what is lost is in no count, since nodes were killed just before."""
+    return plan(583)
+
+
 PLANS = {
     forget_who_has_ended: drowsy,
     accept_gaps: overrun,
@@ -361,6 +389,8 @@ PLANS = {
     begin_from_the_start: deadly,
     go_on_from_a_torn_checkpoint: deadly,
     forget_what_was_published: deadly,
+    end_before_what_was_missed_is_there: killed_at_the_end,
+    ask_only_for_what_is_counted: lost_and_killed,
     name_a_checkpoint_before_it_is_on_the_disk: cut_off,
 }
 """What is rare among the seeds is planned."""
