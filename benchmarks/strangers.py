@@ -22,7 +22,7 @@ from rclpy.executors import ExternalShutdownException
 from std_msgs.msg import String
 rclpy.init()
 node = rclpy.create_node(f'stranger_{os.getpid()}')
-topics = [f'strangers/{number}' for number in range(5)]
+topics = [f'strangers/topic_{number}' for number in range(5)]
 publishers = [node.create_publisher(String, topic, 10) for topic in topics]
 kept = [node.create_subscription(String, topic, lambda m: None, 10) for topic in topics]
 node.create_timer(0.1, lambda: [p.publish(String(data=100 * 'x')) for p in publishers])

@@ -36,7 +36,7 @@ from codetr_ros.records import (
 from codetr_ros.records.digests import digest
 from codetr_ros.records.roles import subscribed
 from codetr_ros.robots import mapping
-from codetr_ros.robots.driving import Driving
+from codetr_ros.robots.driving import MISSED, Driving
 from codetr_ros.robots.guard import Hold
 from codetr_ros.robots.live_scores import LiveScores, scoring
 from codetr_ros.robots.steplog import StepLog
@@ -304,9 +304,9 @@ class Robot(Part):
         counters['steps'] = self._log.total
         counters['times that the node was started again'] = self._restarted
         counters['policies used'] = len(self.versions)
-        return CoreReport(
-            duplicated=dict(self.duplicated), counters={k: n for k, n in counters.items() if n}
-        )
+        shown = {name: count for name, count in counters.items() if count}
+        shown[MISSED] = self.driving.deadlines.missed  # none, too
+        return CoreReport(duplicated=dict(self.duplicated), counters=shown)
 
 
 def load_rules(path: str) -> mapping.Mapping:
