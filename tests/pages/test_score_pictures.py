@@ -4,20 +4,28 @@ import json
 from http.client import HTTPConnection
 from threading import Event
 
+from codetr_ros.cores.camera import Pictures
 from helpers.builders import commit, score_request
 from helpers.http import ask
 from helpers.score_page import DOT, a_desk, judged, served
 
 
 def test_a_segment_that_can_be_drawn_is_shown_in_pictures(tab):
-    with served(a_desk(), frames=lambda segment: [DOT]) as (server, _):
+    with served(a_desk(), frames=lambda segment: Pictures([DOT])) as (server, _):
         opened = tab(server.url)
         opened.get_by_alt_text('the robot, sim, episode 0, steps 35 to 41').wait_for()
 
 
+def test_why_a_segment_has_no_pictures_stands_above_its_curves(tab):
+    with served(a_desk(), frames=lambda segment: Pictures(note='it was <dark>')) as (server, _):
+        opened = tab(server.url)
+        opened.get_by_text('it was <dark>').wait_for()
+        opened.locator('#one canvas').first.wait_for()
+
+
 def test_what_somebody_looks_at_stays_though_the_run_asks_for_other_segments_by_now(tab):
     desk = a_desk(asked=1)
-    with served(desk, frames=lambda segment: [DOT]) as (server, page):
+    with served(desk, frames=lambda segment: Pictures([DOT])) as (server, page):
         opened = tab(server.url)
         opened.get_by_alt_text('the robot, sim, episode 0, steps 35 to 41').wait_for()
         desk.receive(score_request(phase=1, firsts=[14, 56], length=7))
@@ -44,7 +52,7 @@ class Slow:
         self.drawn.append(segment[2])
         self.begun.set()
         assert self.going_on.wait(10)
-        return [DOT]
+        return Pictures([DOT])
 
 
 def test_pictures_of_a_segment_that_was_judged_before_they_came_are_asked_for_no_more(tab):
@@ -81,7 +89,7 @@ def test_pictures_that_nobody_waits_for_any_more_are_not_drawn():
             assert ask(port, '/').status == 200
         slow.going_on.set()
         for connection in (first, last):
-            assert json.loads(connection.getresponse().read()) == {'frames': [DOT]}
+            assert json.loads(connection.getresponse().read()) == {'frames': [DOT], 'note': ''}
             connection.close()
     assert slow.drawn == [35, 56]
 

@@ -23,7 +23,7 @@ from helpers.builders import tiny
 
 FLOW = """
 run                learner                                sim evaluate reward score desk record
-task               sim                                    learner reward record
+task               sim                                    desk learner reward record
 policy             learner                                sim evaluate record
 transitions        sim                                    record reward learner score desk
 composite_rewards  sim score desk                         record reward

@@ -107,12 +107,14 @@ class Offered:
         score: the name of a person for whom there is a page to score on, though the run asks for
             none; empty: nobody.
         service: the services for programs that score.
+        camera: the topic of the pictures on a page to score on; empty: none.
         open: whether the pages are opened in a browser.
     """
 
     watch: bool = False
     score: str = ''
     service: bool = False
+    camera: str = ''
     open: bool = False
 
 
@@ -144,7 +146,8 @@ def pages(
     program = (*PROGRAM, 'score', namespace)
     if offered.score or settings.scorer == 'person':
         name = offered.score or (settings.scorers[0] if settings.scorers else 'person')
-        page = (*program, '--name', name, *opened)
+        camera = ('--camera', offered.camera) if offered.camera else ()
+        page = (*program, '--name', name, *camera, *opened)
         beside.append(Beside(folder, log, SCORE_LOG, page, environment))
     if offered.service:
         beside.append(Beside(folder, log, SERVICE_LOG, (*program, '--service'), environment))

@@ -18,11 +18,12 @@ from codetr_ros.processes import middleware
 
 if TYPE_CHECKING:
     from codetr_ros.config import Settings
+    from codetr_ros.cores.camera import Pictures
     from codetr_ros.cores.core import Core
     from codetr_ros.cores.scoring import Desk
     from codetr_ros.cores.seen import Segment
     from codetr_ros.pages.scoring import Points
-    from codetr_ros.records import RunSpec
+    from codetr_ros.records import Record, RunSpec
     from codetr_ros.ros.joining import Joined, MakeCore
     from codetr_ros.ros.membership import Membership
     from codetr_ros.ros.wiring import Wiring
@@ -63,6 +64,14 @@ class Arguments:
             'know the token that is printed; each names himself'
         ),
     ] = False
+    camera: Annotated[
+        str,
+        tyro.conf.arg(
+            metavar='TOPIC',
+            help='show what a camera publishes there (sensor_msgs Image or CompressedImage), in '
+            'place of drawing what is simulated',
+        ),
+    ] = ''
     host: Host = '127.0.0.1'
     port: Port = 0
     allow_name: AllowedNames = ()
@@ -90,14 +99,18 @@ def main(arguments: Sequence[str]) -> int:
         points = Points.of(given.scale)
     except PageError as error:
         return refuse(str(error))
+    if given.camera and given.service:
+        return refuse('--camera with --service: services show no pictures; leave out one of them')
     try:
-        from codetr_ros.ros import score
+        from codetr_ros.ros import camera, score
         from codetr_ros.ros.node import run_node
     except ImportError as error:
         return refuse(
             f'ROS cannot be imported ({error}): a run is scored over its topics. `codetr doctor` '
             'names what is missing'
         )
+    if given.camera and (wrong := camera.wrong_topic(given.camera)):
+        return refuse(f'--camera {wrong}')
     ros = ['--ros-args', '-r', f'__ns:={given.namespace}', '-p']
     argv = [*ros, f'peer_deadline:={given.peer_deadline}']
     if given.service:
@@ -123,6 +136,9 @@ class Page:
         self._given = given
         self._points = points
         self.problem: str | None = None
+        from codetr_ros.cores.camera import Camera
+
+        self._camera = Camera(given.camera) if given.camera else None
 
     def show(self, url: str) -> None:
         """Print the address of the page, and open it if that is wanted."""
@@ -143,6 +159,10 @@ class Page:
 
         if member.outside:
             self.refuse(cast('Desk', joined.core), member.outside)
+        if self._camera is not None:
+            from codetr_ros.ros.camera import CameraWiring
+
+            return CameraWiring(member, joined, self._camera)
         return Wiring(member, joined)
 
     def load(self) -> 'MakeCore':
@@ -151,18 +171,23 @@ class Page:
         from codetr_ros.cores.scoring import Desk
         from codetr_ros.pages.scoring import ScoringPage
 
-        given, points, show = self._given, self._points, self.show
+        given, points, show, camera = self._given, self._points, self.show, self._camera
 
         class Served(Desk):
             """A desk with a page."""
 
             def __init__(self, run: 'RunSpec', settings: 'Settings') -> None:
                 super().__init__(run, settings, given.name)
-                self._page = ScoringPage(self, points, Drawing(self, settings))
+                self._page = ScoringPage(self, points, camera or Drawing(self, settings))
                 where = given.host, given.port, given.allow_name
                 self._server = self._page.serve(*where).__enter__()
                 self._open = True
                 show(self._server.url)
+
+            def receive(self, record: 'Record') -> None:
+                super().receive(record)
+                if camera is not None:
+                    camera.note(record)
 
             def work(self) -> Any:
                 for records in super().work():
@@ -198,18 +223,19 @@ class Drawing:
         self._lock = threading.Lock()
         self._possible = True
 
-    def __call__(self, segment: 'Segment') -> list[str] | None:
-        """Pictures of a segment; None where it cannot be drawn, which is logged once."""
+    def __call__(self, segment: 'Segment') -> 'Pictures':
+        """Pictures of a segment; none where it cannot be drawn, which is logged once."""
         from codetr_ros.cli import rendering
+        from codetr_ros.cores.camera import Pictures
         from codetr_ros.simulation.frames import write_request
         from codetr_ros.system.parsing import read_json
 
         curves, actions = self._desk.seen.curves(segment), self._desk.seen.actions_before(segment)
         if curves is None or actions is None:
-            return None
+            return Pictures()
         with self._lock, tempfile.TemporaryDirectory() as folder:
             if not self._possible:
-                return None
+                return Pictures()
             sent, made = Path(folder) / 'segment.npz', Path(folder) / 'frames.json'
             source, episode, first, _ = segment
             write_request(sent, self._settings, source, episode, actions, first, curves[0])
@@ -218,6 +244,5 @@ class Drawing:
             if drawn.driver is None:
                 self._possible = False
                 _log.warning('segments are shown by their curves only: %s', drawn.text)
-                return None
-            frames: list[str] = read_json(made)
-            return frames
+                return Pictures()
+            return Pictures(read_json(made))

@@ -131,6 +131,11 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
                 f'--score-service with --scorer {settings.scorer}: nobody else can score; add '
                 '--scorer topic'
             )
+        if extra['camera'] and settings.scorer != 'person':
+            return refuse(
+                f'--camera with --scorer {settings.scorer}: no page to score is served; add '
+                '--scorer person'
+            )
         if extra['score_service'] and in_process:
             return refuse(
                 '--score-service with --in-process: services need nodes; leave out one of them'
@@ -168,7 +173,10 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
     topics = None if in_process else _topics(extra, namespace, start)
     command = shlex.join(['codetr', 'train', *arguments])
     offered = beside.Offered(
-        watch=extra['watch'], service=extra['score_service'], open=extra['open']
+        watch=extra['watch'],
+        service=extra['score_service'],
+        camera=extra['camera'],
+        open=extra['open'],
     )
     shown = Shown(extra['film'], extra['tensorboard'], offered)
     try:

@@ -108,6 +108,18 @@ FLAGS: Sequence[tuple[str, Any, Any]] = [
         False,
     ),
     (
+        'camera',
+        Annotated[
+            str,
+            tyro.conf.arg(
+                metavar='TOPIC',
+                help='show what a camera publishes there (sensor_msgs Image or CompressedImage) '
+                'on the page to score',
+            ),
+        ],
+        '',
+    ),
+    (
         'bag',
         Annotated[
             bool,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from codetr_ros.config import Settings
-from codetr_ros.records import Commit, Record, RunSpec, ScoreRequest, Transitions
+from codetr_ros.records import Commit, Record, RunSpec, ScoreRequest, TaskSpec, Transitions
 from codetr_ros.records.checks import check_run
 
 Segment = tuple[str, int, int, int]
@@ -18,7 +18,7 @@ MOST_STEPS = 100_000
 """Steps whose observations and actions are held for the curves; the oldest episodes go first."""
 NEWEST = 16
 """Segments that are offered where nobody asks for any."""
-KINDS: tuple[type, ...] = (Transitions, ScoreRequest, Commit)
+KINDS: tuple[type, ...] = (TaskSpec, Transitions, ScoreRequest, Commit)
 """What has to be received for it."""
 
 

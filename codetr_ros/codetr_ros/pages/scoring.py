@@ -17,6 +17,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
+from codetr_ros.cores.camera import Pictures
 from codetr_ros.cores.scoring import Desk, ScoringError
 from codetr_ros.cores.seen import Segment
 from codetr_ros.pages.address import HERE, PageError
@@ -32,8 +33,8 @@ MOST_CURVES = 8
 MOST_POINTS = 400
 """Steps of a curve that are shown; of longer segments every so many."""
 
-Frames = Callable[[Segment], list[str] | None]
-"""Draws a segment: pictures as data addresses, in order; None where it cannot be drawn."""
+Frames = Callable[[Segment], Pictures]
+"""Shows a segment in pictures, or states why not."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ class ScoringPage:
     Args:
         desk: what is judged.
         points: the person's scale.
-        frames: draws segments; None: only their curves are shown.
+        frames: has pictures of segments; None: only their curves are shown.
     """
 
     def __init__(self, desk: Desk, points: Points, frames: Frames | None = None) -> None:
@@ -128,7 +129,8 @@ class ScoringPage:
         except ScoringError as error:
             return PlainTextResponse(str(error), 422)
         if sent.get('frames') is True:
-            return JSONResponse({'frames': await self._drawn(request, segment)})
+            drawn = await self._drawn(request, segment)
+            return JSONResponse({'frames': drawn.frames, 'note': drawn.note})
         curves = self._desk.seen.curves(segment)
         if curves is None:
             return PlainTextResponse('the steps of this segment are not held any more', 404)
@@ -144,15 +146,15 @@ class ScoringPage:
             }
         )
 
-    async def _drawn(self, request: Request, segment: Segment) -> list[str]:
+    async def _drawn(self, request: Request, segment: Segment) -> Pictures:
         """Pictures of a segment, one segment at a time; none if whoever asked for them has gone on
         to another one before it was their turn.
         """
         async with self._drawing:
             gone = await request.is_disconnected()
             if gone or self._frames is None or self._desk.seen.curves(segment) is None:
-                return []
-            return await run_in_threadpool(self._frames, segment) or []
+                return Pictures()
+            return await run_in_threadpool(self._frames, segment)
 
 
 def _curves(values: Any, every: int) -> list[list[float]]:

@@ -114,7 +114,7 @@ TABLE: dict[str, Role] = {
     'desk': Role(
         'codetr_ros', 'score',
         publishes=(CompositeReward, Preference),
-        reads=(RunSpec, Transitions, ScoreRequest, Commit),
+        reads=(RunSpec, TaskSpec, Transitions, ScoreRequest, Commit),
         relies_on=('sim', 'record'),
         # nobody waits for a person or a program that scores: they come and go
         count=lambda settings: 0,

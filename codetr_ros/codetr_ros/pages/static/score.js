@@ -21,9 +21,10 @@ class Shown {
     this.title = make('h3', { text: title });
     this.picture = make('img', { className: 'frames', attributes: { alt: '' } });
     this.picture.hidden = true;
+    this.note = make('p', {});
     const observations = make('div');
     const actions = make('div');
-    element.append(this.title, this.picture, observations, actions);
+    element.append(this.title, this.picture, this.note, observations, actions);
     this.observations = new Chart(observations, 'what the robot saw', { xLabel: 'step', height: 160 });
     this.actions = new Chart(actions, 'what it did', { xLabel: 'step', height: 120 });
     this.timer = null;
@@ -35,6 +36,7 @@ class Shown {
     this.segment = segment;
     clearInterval(this.timer);
     this.picture.hidden = true;
+    write(this.note, '');
     // pictures take seconds: those of a segment that nobody looks at any more are not drawn
     this.abandon.abort();
     this.abandon = new AbortController();
@@ -58,8 +60,10 @@ class Shown {
     this.observations.show(curves.observations.map(curve('observation')));
     this.actions.show(curves.actions.map(curve('action')));
     if (!curves.drawn) return;
-    const { frames } = await send('/segment', { segment, frames: true }, signal);
-    if (!same(segment, this.segment) || !frames.length) return;
+    const { frames, note } = await send('/segment', { segment, frames: true }, signal);
+    if (!same(segment, this.segment)) return;
+    write(this.note, note);
+    if (!frames.length) return;
     let at = 0;
     this.picture.alt = `the robot, ${words(segment)}`;
     this.picture.hidden = false;
