@@ -5,8 +5,10 @@ import re
 import time
 import urllib.request
 
+import imageio.v3 as iio
+import numpy as np
 import pytest
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CompressedImage, Image
 
 from codetr_ros.ros.camera import wrong_topic
 from helpers.builders import task_spec, tiny, transitions
@@ -18,6 +20,7 @@ PERIOD = 1000.0  # [s] of a step: no machine is so slow that a picture is of ano
 EVERYBODY = ('learner', 'sim', 'reward', 'record', 'evaluate')
 GREEN = Image(encoding='rgb8', width=4, height=2, step=12, data=bytes([0, 200, 0] * 8))
 TORN = Image(encoding='rgb8', width=4, height=2, step=12, data=bytes(5))
+JPEG = iio.imwrite('<bytes>', np.full((2, 4, 3), 90, np.uint8), extension='.jpg')
 
 
 def shown(url, first):
@@ -27,10 +30,20 @@ def shown(url, first):
         return json.loads(answer.read())
 
 
-def test_the_page_shows_what_a_camera_saw_of_a_segment_and_counts_what_it_refuses(play):
+@pytest.mark.parametrize(
+    ('sound', 'torn', 'why'),
+    [
+        (GREEN, TORN, '4 x 2 pixels rgb8 in rows of 12 bytes do not fit 5 bytes'),
+        (CompressedImage(data=JPEG), CompressedImage(data=JPEG[:20]), 'it is damaged'),
+    ],
+    ids=['raw', 'compressed'],
+)
+def test_the_page_shows_what_a_camera_saw_of_a_segment_and_counts_what_it_refuses(
+    play, sound, torn, why
+):
     play = play(settings=SETTINGS, roles=EVERYBODY)
     sim = play.links['sim']
-    eye = sim.node.create_publisher(Image, '/eye', 10)
+    eye = sim.node.create_publisher(type(sound), '/eye', 10)
     with Command((*CODETR, 'score', NAMESPACE, '--name', 'ann', '--camera', '/eye')) as page:
 
         def stated(pattern):
@@ -49,13 +62,13 @@ def test_the_page_shows_what_a_camera_saw_of_a_segment_and_counts_what_it_refuse
             answer = shown(url, first)
             return answer if found(answer) else None
 
-        answer = play.until(lambda: seen(GREEN, 63, lambda it: it['frames']))
+        answer = play.until(lambda: seen(sound, 63, lambda it: it['frames']))
         assert answer['frames'][0].startswith('data:image/jpeg;base64,')
         assert 'pictures on /eye' in answer['note']
         other = shown(url, 56)
         assert other['frames'] == [] and 's before the oldest one held' in other['note']
-        play.until(lambda: seen(TORN, 63, lambda it: 'refused' in it['note']))
-        play.until(lambda: stated('4 x 2 pixels rgb8 in rows of 12 bytes do not fit 5 bytes'))
+        play.until(lambda: seen(torn, 63, lambda it: 'refused' in it['note']))
+        play.until(lambda: stated(why))
 
 
 @pytest.mark.slow
