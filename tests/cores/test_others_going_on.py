@@ -19,6 +19,7 @@ from codetr_ros.records import (
     EpisodeResult,
     RecordError,
     StepRewards,
+    TaskSpec,
     Transitions,
     TrueRewards,
 )
@@ -102,6 +103,16 @@ def test_a_simulator_goes_on_whatever_topic_its_steps_were_overtaken_by():
 )
 def test_a_simulator_goes_on_within_its_episode_to_the_bit(task, changes):
     check_goes_on(tiny(task=task, **changes))
+
+
+def test_behind_the_last_phase_it_has_finished_whether_or_not_the_learner_is_still_there():
+    settings = tiny(task=FALLS)
+    published = simulate(settings, policies(FALLS))
+    simulator, after = ended_before(settings, [], settings.phases, published)
+    assert simulator.finished and simulator.unpermitted is None
+    assert [type(record) for record in after] == [TaskSpec]
+    simulator, _ = ended_before(settings, [], settings.phases - 1, published)
+    assert not simulator.finished and simulator.unpermitted == settings.phases - 1
 
 
 def test_without_true_rewards_it_goes_on_too():

@@ -130,6 +130,8 @@ class Simulator(Part):
         """
         self._phase = self._first = phase
         self._resumed = True
+        # behind the last phase nothing is left to be permitted, and the learner may be gone
+        self.finished = phase >= self._settings.phases
         self._counters['phases'] = phase
         for source in self._sources:
             source.resume()
