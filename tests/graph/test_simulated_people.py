@@ -105,7 +105,9 @@ def test_a_correction_replaces_what_it_corrects_and_each_scale_is_learnt(a_run):
     for name in PEOPLE:
         assert scorers[name]['scores'] > 3
         assert np.isfinite([scorers[name][what] for what in ('offset', 'slope', 'noise')]).all()
-    assert (scorers['ann']['offset'], scorers['ann']['slope']) == (0, 1), 'she was the first'
+    # the scale of who scored first, which the machine decides, is that of the rewards
+    references = [s for s in scorers.values() if (s['offset'], s['slope']) == (0, 1)]
+    assert len(references) == 1
 
 
 @pytest.mark.slow
