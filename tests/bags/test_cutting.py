@@ -14,7 +14,7 @@ from codetr_ros.records import TOPICS, Commit, EpisodeResult, Metrics, Policy, T
 from codetr_ros.records.dropped import undropped
 from helpers.builders import policy
 from helpers.cores import slices
-from helpers.leaving import bag_with_dropped_steps
+from helpers.leaving import WITH_TWO, bag_with_dropped_steps
 
 BOTH = ('sim', 'sim_2')
 
@@ -23,14 +23,24 @@ def records(folder):
     return [entry.record for entry in Bag(folder).entries()]
 
 
+def behind_last_commit(there):
+    last = max(i for i, record in enumerate(there) if isinstance(record, Commit))
+    return there[last + 1 :]
+
+
 @pytest.fixture(scope='module')
 def made(tmp_path_factory):
-    """A bag of a run from which a simulator was left out, before and after it was cut."""
-    folder = tmp_path_factory.mktemp('cut') / 'bag'
-    simulated, ended = bag_with_dropped_steps(folder)
-    assert ended.failures == [] and ended.errors == {}
-    before = records(folder)
-    return folder, simulated, before, cut(folder)
+    """A bag of a run from which a simulator was left out, before and after it was cut: the first
+    of these runs whose last true rewards come behind the last commit.
+    """
+    for seed in WITH_TWO:
+        folder = tmp_path_factory.mktemp('cut') / 'bag'
+        simulated, ended = bag_with_dropped_steps(folder, seed)
+        assert ended.failures == [] and ended.errors == {}
+        before = records(folder)
+        if any(isinstance(record, TrueRewards) for record in behind_last_commit(before)):
+            return folder, simulated, before, cut(folder)
+    raise AssertionError('true rewards come before the last commit in all of these runs')
 
 
 def test_what_a_simulator_published_and_no_commit_waited_for_stays(made):
@@ -42,8 +52,6 @@ def test_what_a_simulator_published_and_no_commit_waited_for_stays(made):
             type(r) for r in there if isinstance(r, late) and getattr(r, 'role', 'sim') == 'sim'
         )
 
-    last = max(i for i, record in enumerate(before) if isinstance(record, Commit))
-    assert any(isinstance(record, TrueRewards) for record in before[last:])
     assert of_simulators(records(folder)) == of_simulators(before)
     assert left.left_out[f'/run/{TOPICS[Policy]}'] == 1  # the last, which permitted nothing more
     kinds = {finding.kind for finding in verify(folder).findings.named}

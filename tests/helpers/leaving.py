@@ -13,7 +13,8 @@ from codetr_ros.simtest.plan import Plan, all_settings, plan
 from codetr_ros.simtest.process import Pace
 from codetr_ros.simtest.run import Outcome, Simulated
 
-TWO = next(i for i, each in enumerate(all_settings()) if each.simulators == 2)
+WITH_TWO = [i for i, each in enumerate(all_settings()) if each.simulators == 2]
+TWO = WITH_TWO[0]
 FOUR = next(i for i, each in enumerate(all_settings()) if each.simulators == 4)
 
 
@@ -58,13 +59,14 @@ def leaving(
     )
 
 
-def bag_with_dropped_steps(folder: Path) -> tuple[Simulated, Outcome]:
+def bag_with_dropped_steps(folder: Path, seed: int = TWO) -> tuple[Simulated, Outcome]:
     """A run from which `sim_2` was left out in the midst of a phase, and its bag in a folder."""
     torch.set_num_threads(1)
     before = logging.root.manager.disable
     logging.disable(logging.CRITICAL)
     try:
-        simulated = Simulated(leaving(TWO, {'sim_2': [(2.0, 6.0)]}, slow='sim_2'), folder, 100)
+        planned = leaving(seed, {'sim_2': [(2.0, 6.0)]}, slow='sim_2')
+        simulated = Simulated(planned, folder, 100)
         return simulated, simulated.run()
     finally:
         logging.disable(before)
