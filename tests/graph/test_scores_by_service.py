@@ -2,6 +2,7 @@
 
 import re
 import sys
+import time
 import urllib.error
 from pathlib import Path
 
@@ -50,6 +51,14 @@ def called(namespace: str, request: ScoreSegment.Request) -> ScoreSegment.Respon
         rclpy.try_shutdown()
 
 
+def shown_problem(url: str) -> str:
+    """What the page shows as its problem, once it does."""
+    end = time.monotonic() + PATIENCE
+    while (problem := desk_of(url)['problem']) is None:
+        assert time.monotonic() < end
+    return problem
+
+
 @pytest.mark.slow
 def test_a_program_scores_by_service_and_a_page_without_the_key_takes_nothing(tmp_path):
     out = tmp_path / 'run'
@@ -66,9 +75,9 @@ def test_a_program_scores_by_service_and_a_page_without_the_key_takes_nothing(tm
                 scorer.until('scores what')
                 page.until("nothing that 'ben' states is taken")
                 url = page.until(r'score as ben at (http\S+)')[1]
-                desk = desk_of(url)
-                assert 'has a key and this process has none' in desk['problem']
-                assert 'CODETR_RUN_KEY' in desk['problem']
+                problem = shown_problem(url)
+                assert 'has a key and this process has none' in problem
+                assert 'CODETR_RUN_KEY' in problem
                 with pytest.raises(urllib.error.HTTPError, match='422') as refused:
                     judge(url, ['sim', 0, 0, 25], 3)
                 assert 'CODETR_RUN_KEY' in refused.value.read().decode()

@@ -105,15 +105,29 @@ class Mean(Link):
         return np.add.reduceat(f, starts) / m, np.repeat(1 / m, m)
 
 
-class Sum(Mean):
-    """The sum S. In docstrings below, m stands for `_steps`."""
-
-    name = 'sum'
+class Total(Mean):
+    """A score that grows with the steps. In the docstrings of its kinds, m stands for `_steps`."""
 
     def shares(self, m: I64) -> F64:
         """The share m / n."""
         shares: F64 = m / self.whole
         return shares
+
+    def forward(self, f: F64, starts: I64, m: I64) -> tuple[F64, F64]:
+        """The sum / m, and 1/m."""
+        steps = self._steps(m)
+        return np.add.reduceat(f, starts) / steps, np.repeat(1 / steps, m)
+
+    def shift(self, f: F64, level: F64, starts: I64, m: I64) -> F64:
+        """What is added (S,) to all steps of a segment so that they explain its level."""
+        shift: F64 = super().shift(f, level, starts, m) * (self._steps(m) / m)
+        return shift
+
+
+class Sum(Total):
+    """The sum S."""
+
+    name = 'sum'
 
     def level(self, scores: F64, m: I64) -> F64:
         """R / m."""
@@ -127,18 +141,8 @@ class Sum(Mean):
         """-log m."""
         return -np.log(self._steps(m))
 
-    def forward(self, f: F64, starts: I64, m: I64) -> tuple[F64, F64]:
-        """The sum / m, and 1/m."""
-        steps = self._steps(m)
-        return np.add.reduceat(f, starts) / steps, np.repeat(1 / steps, m)
 
-    def shift(self, f: F64, level: F64, starts: I64, m: I64) -> F64:
-        """What is added (S,) to all steps of a segment so that they explain its level."""
-        shift: F64 = super().shift(f, level, starts, m) * (self._steps(m) / m)
-        return shift
-
-
-class SquareSum(Sum):
+class SquareSum(Total):
     """|S| S: its signed root is a sum again."""
 
     name = 'square_sum'
@@ -156,7 +160,7 @@ class SquareSum(Sum):
         return -np.log(2 * self._steps(m) * np.sqrt(_floored(scores)))
 
 
-class SumSquare(Sum):
+class SumSquare(Total):
     """The sum of |r| r: its level is a signed root mean square."""
 
     name = 'sum_square'
