@@ -108,6 +108,7 @@ import os, sys
 from pathlib import Path
 import torch
 from codetr_ros.runs import checkpoints
+from codetr_ros.system import disk
 
 def die_at(step, original):
     def wrapped(*args):
@@ -125,7 +126,7 @@ for phase in (1, 2):
         child = os.fork()
         if child == 0:
             calls = []
-            checkpoints.write_synced = die_at(step, checkpoints.write_synced)
+            disk.write_synced = die_at(step, disk.write_synced)
             checkpoints.sync_folder = die_at(step, checkpoints.sync_folder)
             os.replace = die_at(step, os.replace)
             checkpoints.save(folder, 'learner', phase, {'w': torch.ones(3)}, {'new': True})

@@ -145,8 +145,8 @@ def forget_who_has_ended(patch):
 
 
 def commit_before_counting_the_phase(patch):
-    def commit(self, phase):
-        made = real(self, phase)
+    def commit(self, phase, recorded=None):
+        made = real(self, phase, recorded)
         self.phase = phase
         return made
 
@@ -343,14 +343,16 @@ def unanswered(planned):
 
 def lossy(planned):
     """The same run, but that many messages are lost, and nothing else goes wrong."""
-    return replace(planned, weather=Weather(delay=0.02, lost=0.3, overrun=0.1), disk=Trouble())
+    planned = replace(planned, weather=Weather(delay=0.02, lost=0.3, overrun=0.1), deaths=())
+    return replace(planned, disk=Trouble(), checkpoints=Trouble(), leave_out_after=0.0)
 
 
 def drowsy(planned):
     """The same run, but that all nodes look only now and then at what overtakes on its way."""
     stalls = [(2.0 * i, 1.5) for i in range(60)]
     paces = {name: Pace(stalls=stalls) for name in planned.paces}
-    return replace(planned, weather=Weather(delay=0.3, reorder=True), paces=paces, disk=Trouble())
+    planned = replace(planned, weather=Weather(delay=0.3, reorder=True), paces=paces, deaths=())
+    return replace(planned, disk=Trouble(), checkpoints=Trouble())
 
 
 def cut_off(planned):

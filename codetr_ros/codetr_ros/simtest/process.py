@@ -226,18 +226,22 @@ class Process:
             self._schedule(until)
             return
         try:
-            pause = self._do_turn()
-        except KilledError:
+            pause = self._do_turn_or_fail()
+        except KilledError:  # even while it closed its bag, since it had failed
             self.die()
             self.when_killed(self)
-            return
-        except Exception as error:  # noqa: BLE001 - judged by the simulation, whatever it is
-            self.error = error
-            self.end()
             return
         if not self.ended:
             self._idle = pause is None
             self._schedule(self.world.now + (IDLE if pause is None else pause))
+
+    def _do_turn_or_fail(self) -> float | None:
+        try:
+            return self._do_turn()
+        except Exception as error:  # noqa: BLE001 - judged by the simulation, whatever it is
+            self.error = error
+            self.end()
+            return None
 
     def _do_turn(self) -> float | None:
         """One turn: how long it takes [s]; None if the node waits for messages."""

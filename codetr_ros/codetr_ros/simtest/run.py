@@ -24,7 +24,7 @@ from codetr_ros.cores.learner import Learner
 from codetr_ros.cores.recorder import Recorder
 from codetr_ros.cores.simulator import Simulator
 from codetr_ros.nodes import errors
-from codetr_ros.records import Commit, Record, RunSpec
+from codetr_ros.records import Commit, Record, RecordError, RunSpec
 from codetr_ros.runs import checkpoints
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.checkpoints import CheckpointError, every, latest
@@ -155,7 +155,10 @@ class Simulated:
             except KilledError:
                 made.die()
                 self._killed_within(made)
-            except BagError as error:  # a disk that is full from the beginning
+            except (
+                BagError,
+                RecordError,
+            ) as error:  # a full disk, or a bag that contradicts itself
                 made.error = error
                 made.end()
         return made
