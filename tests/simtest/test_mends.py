@@ -347,12 +347,12 @@ def lossy(planned):
     return replace(planned, disk=Trouble(), checkpoints=Trouble(), leave_out_after=0.0)
 
 
-def drowsy(planned):
-    """The same run, but that all nodes look only now and then at what overtakes on its way."""
-    stalls = [(2.0 * i, 1.5) for i in range(60)]
-    paces = {name: Pace(stalls=stalls) for name in planned.paces}
-    planned = replace(planned, weather=Weather(delay=0.3, reorder=True), paces=paces, deaths=())
-    return replace(planned, disk=Trouble(), checkpoints=Trouble())
+def overtaken(planned):
+    """A run in which what a node has published last is overtaken by seconds, and nothing else."""
+    planned = plan(19)
+    planned = replace(planned, paces={name: Pace() for name in planned.paces}, deaths=())
+    planned = replace(planned, weather=Weather(delay=3.0, reorder=True), leave_out_after=0.0)
+    return replace(planned, disk=Trouble(), checkpoints=Trouble(), heals=True)
 
 
 def cut_off(planned):
@@ -376,7 +376,7 @@ def lost_and_killed(planned):
 
 
 PLANS = {
-    forget_who_has_ended: drowsy,
+    forget_who_has_ended: overtaken,
     accept_gaps: overrun,
     wait_with_all_others: unanswered,
     never_ask_for_announcements: lossy,
