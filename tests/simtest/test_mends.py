@@ -228,10 +228,6 @@ def never_sweep(patch):
     patch.setattr(sweeping.Sweeper, 'ask', lambda self, nodes, lacking=False: None)
 
 
-def forget_early_ones_when_the_gap_before_them_is_filled(patch):
-    patch.setattr(recorder.Recorder, 'still_due', recorder.Recorder.comes_early)
-
-
 def keep_policies_and_labels_in_any_order(patch):
     def place(self, record):
         return None if isinstance(record, (Policy, StepRewards)) else real(self, record)
@@ -317,7 +313,6 @@ MENDS: dict[Callable, str] = {
     never_ask_for_labels: 'gave up',
     never_ask_for_policies: 'gave up',
     never_sweep: 'gave up',
-    forget_early_ones_when_the_gap_before_them_is_filled: 'gave up',
     keep_policies_and_labels_in_any_order: 'not sound',
     leave_the_bag_of_a_killed_recorder_as_it_is: 'not sound|gave up|cannot be read|fault',
     ask_nobody_what_a_killed_recorder_has_missed: 'not sound|gave up',
@@ -384,7 +379,6 @@ PLANS = {
     never_ask_for_labels: lossy,
     never_ask_for_policies: lossy,
     never_sweep: lossy,
-    forget_early_ones_when_the_gap_before_them_is_filled: lossy,
     keep_policies_and_labels_in_any_order: lossy,
     leave_the_bag_of_a_killed_recorder_as_it_is: deadly,
     ask_nobody_what_a_killed_recorder_has_missed: deadly,
