@@ -102,20 +102,29 @@ def test_a_phase_is_read_from_a_file_that_was_made_whole(killed, tmp_path):
     assert len({len(messages) for messages in found}) == 1
 
 
+def in_two_files(folder, records, cut, left):
+    """The phases of a bag that was gone on with behind so many records.
+
+    Args:
+        left: how the first writer was left: flushed, as by who is killed, or closed.
+    """
+    writer = McapWriter(folder, own_topics(), chunk_bytes=1000)
+    write(writer, records[:cut])
+    left(writer)
+    phases = Phases()
+    written = reopen(folder, lambda raw: phases.note(Bag(folder).entry(raw).record, raw.place))
+    writer = McapWriter(folder, own_topics(), chunk_bytes=1000, written=written)
+    write(writer, records[cut:], phases)
+    return phases
+
+
 def test_a_phase_is_read_from_the_file_of_a_killed_recorder_and_the_next(tmp_path):
     """It was under way when the recorder was killed: the first file begins before it and has an
     end by now.
     """
     folder, records = tmp_path / 'bag', a_run()
     first, second, _ = (i for i, record in enumerate(records) if isinstance(record, Commit))
-    halfway = (first + second) // 2
-    writer = McapWriter(folder, own_topics(), chunk_bytes=1000)
-    write(writer, records[:halfway])
-    writer.flush()
-    phases = Phases()
-    written = reopen(folder, lambda raw: phases.note(Bag(folder).entry(raw).record, raw.place))
-    writer = McapWriter(folder, own_topics(), chunk_bytes=1000, written=written)
-    write(writer, records[halfway:], phases)
+    phases = in_two_files(folder, records, (first + second) // 2, McapWriter.flush)
     assert len(Bag(folder).files) == 2
     found = [raw for _, raw in phases.read(1)]
     assert found == [
@@ -140,13 +149,7 @@ def test_a_phase_that_goes_on_in_the_next_file_is_read_from_both(tmp_path):
     """All nodes were stopped in the midst of a phase; or a file became too large there."""
     folder, records = tmp_path / 'bag', a_run()
     cut = next(i for i, r in enumerate(records) if getattr(r, 'sequence', -1) == 5)  # of phase 1
-    writer = McapWriter(folder, own_topics(), chunk_bytes=1000)
-    write(writer, records[:cut])
-    writer.close()
-    phases = Phases()
-    written = reopen(folder, lambda raw: phases.note(Bag(folder).entry(raw).record, raw.place))
-    writer = McapWriter(folder, own_topics(), chunk_bytes=1000, written=written)
-    write(writer, records[cut:], phases)
+    phases = in_two_files(folder, records, cut, McapWriter.close)
     wanted = [
         raw_of(record)
         for record in records

@@ -14,6 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from kills import nodes
+
 PATIENCE = 240.0
 CODETR = (sys.executable, '-m', 'codetr_ros.cli')
 
@@ -83,19 +85,6 @@ class Command:
         return code
 
 
-def children(pid: int) -> dict[int, str]:
-    """The processes that a process has started: the command line of each by its number."""
-    found = {}
-    for folder in Path('/proc').glob('[0-9]*'):
-        try:
-            parent = int((folder / 'stat').read_text().rsplit(')', 1)[1].split()[1])
-            if parent == pid:
-                found[int(folder.name)] = (folder / 'cmdline').read_text().replace('\0', ' ')
-        except (FileNotFoundError, ProcessLookupError):
-            continue  # it has ended meanwhile
-    return found
-
-
 @contextmanager
 def held(train: Command, out: Path, node: str = 'learner') -> Iterator[None]:
     """Hold a node of a run that has begun, so that the run cannot end meanwhile.
@@ -103,13 +92,13 @@ def held(train: Command, out: Path, node: str = 'learner') -> Iterator[None]:
     Args:
         train: the command that has started the nodes.
         out: the folder of the run.
-        node: the name of the node, and of its program.
+        node: the role of the node.
     """
     log, end = out / 'logs' / f'{node}.log', time.monotonic() + PATIENCE
     while not (log.exists() and 'everybody is there' in log.read_text()):
         assert time.monotonic() < end and train.process.poll() is None, train.text
         time.sleep(0.01)
-    (pid,) = (pid for pid, words in children(train.process.pid).items() if f'/{node} ' in words)
+    pid = nodes(out)[node]
     os.kill(pid, signal.SIGSTOP)
     try:
         yield

@@ -61,26 +61,33 @@ def publish_a_phase(play):
     return named
 
 
+def finishes(play, deaf, folder, deadline=30.0):
+    """Let a reward node that something does not reach finish its only phase, beside a recorder;
+    what it logs, and its report.
+    """
+    with (
+        process('record') as record,
+        process(deaf, f'folder:={folder}', f'peer_deadline:={deadline}') as node,
+    ):
+        play.until(lambda: read_by(play, 'record', 'reward') and waits_for_a_phase(play), node)
+        publish_a_phase(play)
+        labels = play.until(lambda: play.messages('StepRewards', 'learner'), node)[0]
+        assert list(labels.lengths) == [5]
+        play.until(lambda: [p for p in play.presence_of('reward') if p.finished])
+        play.finished = True
+        play.until(lambda: node.poll() is not None and record.poll() is not None)
+        said = output(node)
+    assert node.returncode == 0, said
+    return said, json.loads(run_folder.report_path(folder, 'reward', 'reward').read_text())
+
+
 @pytest.mark.slow
 def test_a_phase_that_a_node_lacks_is_fetched_from_the_recorder_and_the_loss_is_excused(
     play, tmp_path
 ):
     play = play(settings=settings(), roles=('learner', 'sim'))
-    with (
-        process('record') as record,
-        process('deaf', f'folder:={tmp_path}', 'peer_deadline:=20.0') as deaf,
-    ):
-        play.until(lambda: read_by(play, 'record', 'reward') and waits_for_a_phase(play), deaf)
-        publish_a_phase(play)
-        labels = play.until(lambda: play.messages('StepRewards', 'learner'), deaf)[0]
-        assert list(labels.lengths) == [5]
-        play.until(lambda: [p for p in play.presence_of('reward') if p.finished])
-        play.finished = True
-        play.until(lambda: deaf.poll() is not None and record.poll() is not None)
-        said = output(deaf)
-    assert deaf.returncode == 0, said
+    said, report = finishes(play, 'deaf', tmp_path, deadline=20.0)
     assert 'phase 0 is incomplete: asking the recorder for it' in said
-    report = json.loads(run_folder.report_path(tmp_path, 'reward', 'reward').read_text())
     assert report['fetched'] == {'transitions': 1}
     assert report['lost'] == {}
     assert report['duplicated'] == {'composite_rewards': 1, 'commits': 1}
@@ -91,20 +98,8 @@ def test_a_phase_that_a_node_lacks_is_fetched_from_the_recorder_and_the_loss_is_
 @pytest.mark.slow
 def test_a_commit_that_was_lost_is_asked_for_though_none_follows(play, tmp_path):
     play = play(settings=settings(), roles=('learner', 'sim'))
-    with (
-        process('record') as record,
-        process('uncommitted', f'folder:={tmp_path}', 'peer_deadline:=30.0') as node,
-    ):
-        play.until(lambda: read_by(play, 'record', 'reward') and waits_for_a_phase(play), node)
-        publish_a_phase(play)
-        play.until(lambda: play.messages('StepRewards', 'learner'), node)
-        play.until(lambda: [p for p in play.presence_of('reward') if p.finished])
-        play.finished = True
-        play.until(lambda: node.poll() is not None and record.poll() is not None)
-        said = output(node)
-    assert node.returncode == 0, said
+    said, report = finishes(play, 'uncommitted', tmp_path)
     assert 'the commit of phase 0 was lost: it came again' in said
-    report = json.loads(run_folder.report_path(tmp_path, 'reward', 'reward').read_text())
     assert report['lost'] == {}
 
 
@@ -116,20 +111,8 @@ def test_what_a_source_has_announced_is_asked_for_if_it_was_lost(play, tmp_path)
     outbox.keep(task_spec())
     for record in (transitions(phase=1, sequence=1), transitions(phase=2, sequence=2)):
         outbox.keep(record)  # of later phases: what was announced is not among the newest
-    with (
-        process('record') as record,
-        process('unannounced', f'folder:={tmp_path}', 'peer_deadline:=30.0') as node,
-    ):
-        play.until(lambda: read_by(play, 'record', 'reward') and waits_for_a_phase(play), node)
-        publish_a_phase(play)
-        play.until(lambda: play.messages('StepRewards', 'learner'), node)
-        play.until(lambda: [p for p in play.presence_of('reward') if p.finished])
-        play.finished = True
-        play.until(lambda: node.poll() is not None and record.poll() is not None)
-        said = output(node)
-    assert node.returncode == 0, said
+    said, report = finishes(play, 'unannounced', tmp_path)
     assert 'what a source has announced had not arrived: it came again' in said
-    report = json.loads(run_folder.report_path(tmp_path, 'reward', 'reward').read_text())
     assert report['lost'] == report['duplicated'] == {}
     assert report['fetched'] == {'task': 1}
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from codetr_ros.cli import rendering, video
 from codetr_ros.runs import folder as run_folder
-from codetr_ros.system.files import atomic_write, sync_folder
+from codetr_ros.system.files import atomic_write
 
 if TYPE_CHECKING:
     from codetr_ros.config import Settings
@@ -185,15 +185,10 @@ def _write_video(file: Path, episodes: 'Sequence[Sequence[Frame]]', pace: video.
     """Episodes side by side; of one that has ended, the last frame stays."""
     import numpy as np
 
-    partial = video.partial_of(file)
-    try:
-        with pace.writing(partial, (WIDTH * len(episodes), HEIGHT)) as put:
-            for i in range(max(map(len, episodes))):
-                put(np.hstack([frames[min(i, len(frames) - 1)] for frames in episodes]))
-        os.replace(partial, file)
-        sync_folder(file.absolute().parent)
-    finally:
-        partial.unlink(missing_ok=True)
+    size = WIDTH * len(episodes), HEIGHT
+    with video.replacing(file) as partial, pace.writing(partial, size) as put:
+        for i in range(max(map(len, episodes))):
+            put(np.hstack([frames[min(i, len(frames) - 1)] for frames in episodes]))
 
 
 def strip(rows: Mapping[str, Moments]) -> bytes:

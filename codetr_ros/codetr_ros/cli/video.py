@@ -122,21 +122,28 @@ def make(
     """
     arguments = (str(folder), str(file), str(settings.evaluate_episodes), str(settings.seed))
     given = {**environment, **launcher.module_environment(settings, environment)}
+    with replacing(file) as partial:
+        drawn = rendering.draw([*program, *arguments], partial, DEADLINE, given)
+        if not drawn.possible:
+            raise VideoError(f'no video {file}: {drawn.text}')
+        if drawn.driver is None:
+            raise VideoError(
+                f'no video {file}: MuJoCo cannot draw here ({drawn.text}). `codetr doctor` says '
+                'what it needs'
+            )
+    return f'{file}: {drawn.text} (drawn by {drawn.driver})'
+
+
+@contextmanager
+def replacing(file: Path) -> Iterator[Path]:
+    """Where a video is written first: it takes the place of the file if all goes well."""
     partial = partial_of(file)
     try:
-        drawn = rendering.draw([*program, *arguments], partial, DEADLINE, given)
-        if drawn.driver is not None:
-            os.replace(partial, file)
-            sync_folder(file.absolute().parent)
-            return f'{file}: {drawn.text} (drawn by {drawn.driver})'
+        yield partial
+        os.replace(partial, file)
+        sync_folder(file.absolute().parent)
     finally:
         partial.unlink(missing_ok=True)
-    if not drawn.possible:
-        raise VideoError(f'no video {file}: {drawn.text}')
-    raise VideoError(
-        f'no video {file}: MuJoCo cannot draw here ({drawn.text}). `codetr doctor` says what it '
-        'needs'
-    )
 
 
 def partial_of(file: Path) -> Path:

@@ -45,6 +45,7 @@ class Evaluator(Part):
             deque()
         )  # purpose, version, policy
         self._seen: set[int] = set()  # versions that are evaluated or wait for it
+        self._awaited = 0  # of the versions before it, none is awaited
         self._done: dict[int, set[int]] = {}  # episodes of each that were evaluated before
         self._counters: Counter[str] = Counter()
         self._closed = False
@@ -97,13 +98,12 @@ class Evaluator(Part):
             return settings.phases - 1 + settings.lag
         if INITIAL_VERSION not in self._seen:
             return 0
-        awaited = (
-            version
-            for version in range(settings.phases)
-            if settings.evaluated(version) and version not in self._seen
-        )
-        version = next(awaited, None)
-        return None if version is None else version + settings.lag
+        # asked in each turn: what was passed over once is not looked at again
+        while self._awaited < settings.phases and (
+            self._awaited in self._seen or not settings.evaluated(self._awaited)
+        ):
+            self._awaited += 1
+        return None if self._awaited == settings.phases else self._awaited + settings.lag
 
     def waiting_for(self) -> str:
         """What the next slice waits for, for people."""

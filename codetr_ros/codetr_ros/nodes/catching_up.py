@@ -5,6 +5,7 @@ simulator.
 
 import time
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 from codetr_ros.cores.core import Core
@@ -30,6 +31,7 @@ OF_PHASES = (Transitions, CompositeReward, Preference, Commit)
 """Kinds of records that a commit names, and itself."""
 
 RECORDER = 'the recorder'
+PERMISSION = 'permission for phase {} had not arrived: it came again'
 
 TakeAgain = Callable[..., object]
 """Takes the bytes of a message that was fetched again."""
@@ -60,13 +62,13 @@ class Fetcher:
         phases: bool,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._make = make
+        self._asker = cache(make)  # one for each service
+        if phases:
+            self._asker(SERVICE)
         self._peers = peers
         self._take = take
         self._log = log
         self._clock = clock
-        # by the names of their services
-        self._askers: dict[str, Asks] = {SERVICE: make(SERVICE)} if phases else {}
         self._phases, self._labels, self._commits = Fetching(), Fetching(), Fetching()
         self._tasks, self._permissions = Fetching(), Fetching()
         self._offered, self._committed, self._permitted = Offered(), Offered(), Offered()
@@ -117,21 +119,17 @@ class Fetcher:
             outbox: what the node has published lately.
         """
         due = core.due
+        # what is looked at in each turn comes first: most nodes are behind nothing
         return (
-            outbox.owes
-            and due is not None
+            due is not None
             and due <= self.behind
+            and outbox.owes
             and any(not peer.presence.finished for peer in self._peers.alive('learner'))
         )
 
     @property
     def _recorder(self) -> Asks:
         return self._asker(SERVICE)
-
-    def _asker(self, service: str) -> Asks:
-        if service not in self._askers:
-            self._askers[service] = self._make(service)
-        return self._askers[service]
 
     def _ask_recorder(self, phase: int) -> None:
         if not self._recorder.ready:
@@ -154,9 +152,8 @@ class Fetcher:
         if answer.reason or not answer.messages:
             return  # it has not committed the phase yet
         if self._committed.lost(phase, self._clock()):
-            self._log.warning(f'the commit of phase {phase} was lost: it came again')
-            for kind, data in answer.messages:
-                self._take(kind, data, lost=True)
+            said = f'the commit of phase {phase} was lost: it came again'
+            self._take_all(answer, said, lost=True)
 
     def _ask_reward(self, phase: int) -> None:
         for asker in self._nodes('reward')[:1]:
@@ -170,9 +167,7 @@ class Fetcher:
                 asker.ask(NEWEST, self._announced, [type_name(TaskSpec)])
 
     def _announced(self, answer: Answer) -> None:
-        for kind, data in answer.messages:
-            self._log.warning('what a source has announced had not arrived: it came again')
-            self._take(kind, data)
+        self._take_all(answer, 'what a source has announced had not arrived: it came again')
 
     def _ask_learner(self, phase: int) -> None:
         """Ask for the policy that is waited for: if it was lost, none may follow that shows it."""
@@ -184,21 +179,19 @@ class Fetcher:
         if answer.reason or not answer.messages:
             self._ask_for_earlier(phase)  # it has not permitted the phase yet, or long ago
         elif self._permitted.lost(phase, self._clock()):
-            self._log.warning(f'permission for phase {phase} had not arrived: it came again')
-            for kind, data in answer.messages:
-                self._take(kind, data)
+            self._take_all(answer, PERMISSION.format(phase))
 
     def _ask_for_earlier(self, phase: int) -> None:
         """Ask for a policy that the learner may keep no more."""
         if self._recorder.ready:
             kinds = [type_name(Policy)]
-            self._recorder.ask(phase, lambda answer: self._recorded_policy(phase, answer), kinds)
+            said = PERMISSION.format(phase)  # if it is recorded, it was published long ago
+            self._recorder.ask(phase, lambda answer: self._take_all(answer, said), kinds)
 
-    def _recorded_policy(self, phase: int, answer: Answer) -> None:
-        if not answer.reason:  # it is of a committed phase, and so was published long ago
-            for kind, data in answer.messages:
-                self._log.warning(f'permission for phase {phase} had not arrived: it came again')
-                self._take(kind, data)
+    def _take_all(self, answer: Answer, said: str, **how: bool) -> None:
+        for kind, data in answer.messages:
+            self._log.warning(said)
+            self._take(kind, data, **how)
 
     def _nodes(self, role: str) -> list[Asks]:
         """Those that ask the nodes of a role which are there and answer."""

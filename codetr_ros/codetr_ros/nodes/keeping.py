@@ -27,9 +27,7 @@ from codetr_ros.nodes.traffic import Traffic
 from codetr_ros.records import (
     TOPICS,
     Commit,
-    CompositeReward,
     Policy,
-    Preference,
     Record,
     RecordError,
     RunSpec,
@@ -37,6 +35,7 @@ from codetr_ros.records import (
     TaskSpec,
     Transitions,
 )
+from codetr_ros.records.numbering import Judgement
 from codetr_ros.records.roles import ROLES, WRITERS
 
 RECORDED_TOPICS = [TOPICS[kind] for kind in RECORDED]
@@ -46,7 +45,6 @@ keep it for some phases only, so that it commits none meanwhile."""
 ASKS_ALL = (5.0, 30.0)
 """For how long [s] all others have waited when all of them are asked for what is lacking; behind
 that it is nothing that they have."""
-JUDGEMENTS = (CompositeReward, Preference)
 
 
 @dataclass(frozen=True)
@@ -216,7 +214,7 @@ class Keeping:
         labels, of which the bag may hold less than came. The core refuses another policy for a
         phase that is permitted already.
         """
-        if isinstance(record, (Transitions, *JUDGEMENTS, StepRewards)):
+        if isinstance(record, Transitions | Judgement | StepRewards):
             return False
         if not self._bag.repeats.knows(record):
             return False

@@ -4,9 +4,10 @@ was cut.
 
 import time
 from collections.abc import Callable, Iterable
+from functools import cache
 from typing import Any
 
-from codetr_ros.nodes.asking import NEWEST, Answer, Asks, MakeAsks, service_of
+from codetr_ros.nodes.asking import NEWEST, Answer, MakeAsks, service_of
 from codetr_ros.nodes.fetching import AGAIN
 
 UNNEWS = 3
@@ -38,12 +39,11 @@ class Sweeper:
         log: Any,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._make = make
+        self._asker = cache(make)  # one for each service
         self._known = known
         self._take = take
         self._log = log
         self._clock = clock
-        self._askers: dict[str, Asks] = {}
         self._wanted: dict[str, float] = {}  # nodes to be asked, and when at the earliest
         self._asked: dict[str, float] = {}  # when each has answered last
         self._thorough: set[str] = set()  # nodes that are to be asked for all that they keep
@@ -74,16 +74,13 @@ class Sweeper:
     def check(self) -> None:
         """Go on with the next node, where one has answered or does not answer any more."""
         if self._present is not None:
-            if self._askers[self._present].busy:
+            if self._asker(service_of(self._present)).busy:
                 return
             self._wanted[self._present] = 0.0  # it was killed meanwhile: ask it once more
             self._end()
         now = self._clock()
         for node in [node for node, due in self._wanted.items() if due <= now]:
-            asker = self._askers.get(node)
-            if asker is None:
-                asker = self._askers[node] = self._make(service_of(node))
-            if asker.ready:
+            if self._asker(service_of(node)).ready:
                 del self._wanted[node]
                 self._present, self._phases, self._news = node, [], 0
                 self._ask(NEWEST)
@@ -94,7 +91,8 @@ class Sweeper:
         assert node is not None
         self._round += 1
         asked = self._round
-        self._askers[node].ask(phase, lambda answer: self._answered(asked, answer))
+        asker = self._asker(service_of(node))
+        asker.ask(phase, lambda answer: self._answered(asked, answer))
 
     def _answered(self, asked: int, answer: Answer) -> None:
         if asked != self._round or self._present is None:

@@ -84,7 +84,7 @@ class CameraWiring(Wiring):
             # here, not later: what is too much is not even kept
             if self._camera.due(time.monotonic()):
                 self.member.link.store(self._take_picture, of_type, data, node.get_clock().now())
-            else:
+            else:  # noted all the same: else what came behind it waits for the next turn
                 self.member.link.store(lambda: None)
 
         node.create_subscription(of_type, topic, store, SENSOR, raw=True)

@@ -7,7 +7,6 @@ what is missing, work one slice, publish what came out.
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -427,8 +426,8 @@ class Process:
         def read(phase: int, kinds: Any) -> list[tuple[type, bytes]]:
             return [(type(r), self._encoded(r)) for r in self._outbox.read(phase, kinds)]
 
-        newest = partial(getattr, self._outbox, 'newest')
-        return answer_to(request.phase, request.kinds, read, newest, self.log)
+        outbox = self._outbox
+        return answer_to(request.phase, request.kinds, read, lambda: outbox.newest, self.log)
 
     def _encoded(self, record: Record) -> bytes:
         return encode(record, round(self.world.now * 1e9))

@@ -133,8 +133,8 @@ class Recording(Process):
 
     def answer(self, request: FetchRequest) -> Answer:
         """What the recorder answers: it sends a phase again from the bag."""
-        newest = lambda: self.bag.newest  # noqa: E731
-        return answer_to(request.phase, request.kinds, self.bag.read, newest, self.log)
+        bag = self.bag
+        return answer_to(request.phase, request.kinds, bag.read, lambda: bag.newest, self.log)
 
     def deliver(self, record: Record) -> None:
         """Publish a record of the core; a commit only after all that it names is on the disk."""

@@ -155,10 +155,8 @@ class Simulated:
             except KilledError:
                 made.die()
                 self._killed_within(made)
-            except (
-                BagError,
-                RecordError,
-            ) as error:  # a full disk, or a bag that contradicts itself
+            except (BagError, RecordError) as error:
+                # a full disk, or a bag that contradicts itself
                 made.error = error
                 made.end()
         return made

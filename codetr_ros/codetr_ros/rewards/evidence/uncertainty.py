@@ -64,7 +64,14 @@ class Levels:
 
     mean: F64  # (S,)
     variance: F64  # (S,) predicted from their steps alone
-    covariance: F64  # (S, S) under the posterior of the weights alone
+    rows: Tensor  # (S, D) what weights are multiplied by for a level
+    of_weights: Tensor  # (D, D) covariance of the weights
+
+    @property
+    def covariance(self) -> F64:
+        """Covariance (S, S) under the posterior of the weights alone."""
+        covariance: F64 = (self.rows @ self.of_weights @ self.rows.T).numpy()
+        return covariance
 
 
 def levels(model: Model, features: list[Tensor], m: I64) -> Levels:
@@ -84,5 +91,4 @@ def levels(model: Model, features: list[Tensor], m: I64) -> Levels:
     rows = torch.stack([w @ part.double() for w, part in zip(weights, parts, strict=True)])
     step_noise, score_noise = np.exp(model.theta[-2:])
     own = step_noise * np.add.reduceat(slopes * slopes, starts) + score_noise
-    covariance: F64 = (rows @ known.covariance @ rows.T).numpy()
-    return Levels(mean, known.variances(rows).numpy() + own, covariance)
+    return Levels(mean, known.variances(rows).numpy() + own, rows, known.covariance)
