@@ -1,7 +1,6 @@
 """Simulated people, each with a scale of its own, and a person who joins them, over topics."""
 
 import os
-import time
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from codetr_ros.cli import main
 from codetr_ros.nodes.signing import VARIABLE, new_key
 from codetr_ros.records import Commit, CompositeReward, ScoreRequest
 from codetr_ros.runs import reports
-from helpers.judging import CODETR, PATIENCE, Command, desk_of, held, judge, summary_of
+from helpers.judging import CODETR, PATIENCE, Command, first_waiting, held, judge, summary_of
 from helpers.nodes import domain
 
 FLAGS = (
@@ -28,12 +27,10 @@ PEOPLE = ('person_a', 'person_b')
 
 def corrected(url: str) -> tuple:
     """Score a segment on a page, and correct the score; the segment."""
-    end = time.monotonic() + PATIENCE
-    while not (waiting := desk_of(url)['waiting']):
-        assert time.monotonic() < end
-    judge(url, waiting[0], 2)
-    assert judge(url, waiting[0], 5)['sequence'] == 1
-    return tuple(waiting[0])
+    segment = first_waiting(url)
+    judge(url, segment, 2)
+    assert judge(url, segment, 5)['sequence'] == 1
+    return tuple(segment)
 
 
 @pytest.fixture(scope='module')

@@ -115,12 +115,30 @@ def desk_of(url: str) -> dict[str, Any]:
     raise AssertionError('the page publishes no desk')
 
 
-def judge(url: str, segment: Sequence[Any], value: float) -> dict[str, Any]:
-    """Score a segment on the page of a scorer."""
-    sent = json.dumps({'segment': segment, 'value': value}).encode()
-    request = urllib.request.Request(url + 'judge', sent, {'Content-Type': 'application/json'})
+def asked(url: str, **sent: Any) -> dict[str, Any]:
+    """The answer of a page to what its browser sends."""
+    data = json.dumps(sent).encode()
+    request = urllib.request.Request(url, data, {'Content-Type': 'application/json'})
     with urllib.request.urlopen(request, timeout=60) as answer:
         return json.loads(answer.read())  # type: ignore[no-any-return]
+
+
+def judge(url: str, segment: Sequence[Any], value: float) -> dict[str, Any]:
+    """Score a segment on the page of a scorer."""
+    return asked(url + 'judge', segment=segment, value=value)
+
+
+def pictures(url: str, segment: Sequence[Any]) -> dict[str, Any]:
+    """The pictures of a segment on the page of a scorer, and what it states of them."""
+    return asked(url + 'segment', segment=segment, frames=True)
+
+
+def first_waiting(url: str) -> list[Any]:
+    """The segment that comes first on the page of a scorer, once one waits."""
+    end = time.monotonic() + PATIENCE
+    while not (waiting := desk_of(url)['waiting']):
+        assert time.monotonic() < end
+    return waiting[0]  # type: ignore[no-any-return]
 
 
 def judge_until_taken(url: str) -> set[int]:
