@@ -57,3 +57,15 @@ def test_true_rewards_are_taken_of_a_source_that_was_left_out_of_phases_one_afte
     for sequence in (due, 1):  # the second was under way when its source was left out
         beside.receive(true_rewards(sequence, 4))
     assert beside.duplicated == {}
+
+
+def test_true_rewards_of_what_a_commit_names_are_lacking_until_they_come():
+    beside = Beside(run(SETTINGS), SETTINGS, lambda: 0)
+    named = commit(transitions=np.array([2]))
+    assert not beside.lacks_true_rewards(named), 'a source may have none'
+    for sequence in (0, 1):
+        beside.receive(true_rewards(sequence, 0))
+        assert beside.lacks_true_rewards(named)
+    beside.receive(true_rewards(2, 0))
+    assert not beside.lacks_true_rewards(named)
+    assert not beside.lacks_true_rewards(commit(transitions=np.array([5]), dropped=('sim',)))

@@ -80,7 +80,7 @@ def test_a_run_all_of_which_is_killed_goes_on_and_gets_longer_and_has_the_same_w
 def test_a_run_from_which_a_simulator_was_left_out_goes_on_and_gets_longer(tmp_path):
     """Its weights are those that learn again from what was recorded."""
     changes = {
-        'overlap': True, 'simulators': 2, 'steps': 1500, 'phase_steps': 100, 'evaluate_every': 0,
+        'overlap': True, 'simulators': 2, 'steps': 4000, 'phase_steps': 100, 'evaluate_every': 0,
     }  # fmt: skip
     folder = tmp_path / 'run'
     command = start(write(SETTINGS.changed(changes), folder), folder, '--leave-out-after', '2')
@@ -89,7 +89,7 @@ def test_a_run_from_which_a_simulator_was_left_out_goes_on_and_gets_longer(tmp_p
     log = folder / 'logs' / 'record.log'
     until(lambda: 'sim_2 is left out of phase' in log.read_text(), command, folder)
     kill(command, folder)
-    for steps in (1500, 2000):
+    for steps in (4000, 4500):
         summary = resumed(folder, '--steps', str(steps))
         assert summary['steps'] == steps
         assert verify(folder / 'bag').sound

@@ -107,6 +107,17 @@ class Beside:
                 if kind is Transitions:
                     self._pass_over(source, named(record)[kind, source])
 
+    def lacks_true_rewards(self, commit: Commit) -> bool:
+        """Whether a source that publishes true rewards has not yet published those of all steps
+        that a commit names. They come right behind the steps; a source that has published none so
+        far may have none.
+        """
+        return any(
+            kind is Transitions and 0 < self._due[source] <= last
+            for (kind, source), last in named(commit).items()
+            if (kind, source) not in void(commit)
+        )
+
     def _within(self, record: Record, value: int, least: int, most: int, name: str) -> None:
         if not least <= value <= most:
             raise RecordError(

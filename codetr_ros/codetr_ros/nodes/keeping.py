@@ -267,6 +267,12 @@ class Keeping:
         self._sweeper.check()
         return True
 
+    def lacks_true_rewards(self, commit: Commit) -> bool:
+        """Whether true rewards of steps that a commit names are still to come. No commit needs
+        them, but were all nodes killed right behind it, nobody would publish them again.
+        """
+        return self._beside.lacks_true_rewards(commit)
+
     def look_after(self) -> None:
         """Ask for what was lost on the way, and leave out who is silent for too long."""
         self._leave_out()

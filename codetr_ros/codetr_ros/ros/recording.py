@@ -10,6 +10,7 @@ nodes for what it has missed. The service `fetch_phase` sends any committed phas
 bag; without a bag, the last ones from memory.
 """
 
+import time
 from collections import deque
 from collections.abc import Collection, Iterable
 from pathlib import Path
@@ -30,6 +31,9 @@ from codetr_ros.ros.resend import PhaseService
 from codetr_ros.ros.wiring import Wiring
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs.reports import BagReport
+
+BEHIND = 0.5
+"""The most seconds that a commit waits for true rewards, which come right behind the steps."""
 
 
 class Recording(Wiring):
@@ -121,6 +125,9 @@ class Recording(Wiring):
             super().deliver(given)
             return
         while not self.member.stop and self._keeping.catches_up():
+            self.member.turn(IDLE)
+        end = time.monotonic() + BEHIND
+        while self._keeping.lacks_true_rewards(given) and time.monotonic() < end:
             self.member.turn(IDLE)
         self._bag.check_room()
         raw = link.message(given)
