@@ -39,6 +39,11 @@ def test_a_run_ends_well_and_is_replayed_though_its_nodes_were_killed_and_all_of
             person.until(lambda: person.committed(1))
             run.kill('record')
             person.until(lambda: 'goes on with' in run.log('record'))
+            again = (
+                f'record {nodes.NAMESPACE}/record is there again'  # else they end with an error
+            )
+            for name in ('learner', 'reward', 'robot'):
+                person.until(lambda name=name: again in run.log(name))
             person.until(lambda: person.committed(2))
             person.ticks(15)
             for name in ('inspection', *ROLES):

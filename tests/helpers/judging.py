@@ -86,8 +86,9 @@ class Command:
 
 
 @contextmanager
-def held(train: Command, out: Path, node: str = 'learner') -> Iterator[None]:
-    """Hold a node of a run that has begun, so that the run cannot end meanwhile.
+def held(train: Command, out: Path, node: str = 'reward') -> Iterator[None]:
+    """Hold a node of a run that has begun, so that the run cannot end meanwhile. Who joins a run
+    waits for its learner, recorder and simulators, and for no reward node.
 
     Args:
         train: the command that has started the nodes.

@@ -4,9 +4,10 @@ import logging
 from dataclasses import replace
 
 from codetr_ros.bags.definitions import encode
+from codetr_ros.cores.labeller import Labeller
 from codetr_ros.nodes.traffic import Traffic
 from codetr_ros.records import Transitions
-from helpers.builders import transitions
+from helpers.builders import score, tiny, transitions
 
 
 def test_what_is_of_another_run_does_not_stand_in_for_what_is_lost_of_this_one():
@@ -17,3 +18,18 @@ def test_what_is_of_another_run_does_not_stand_in_for_what_is_lost_of_this_one()
     assert traffic.decode(Transitions, b'junk') is None
     assert traffic.received == {'transitions': 2}  # one sound, one not
     assert traffic.refused == {'transitions': 1}
+
+
+def test_what_a_node_fetches_again_once_it_has_joined_was_not_taken_before():
+    settings = tiny()
+    traffic = Traffic(logging.getLogger(__name__))
+    core = Labeller(settings.run_spec('run'), settings, 'reward', None)
+    traffic.core, traffic.settings = core, settings
+    traffic.hold()
+    for record in (transitions(), score()):
+        assert traffic.receive(record)
+    traffic.release(later=lambda record: True)
+    for record in (transitions(), score()):
+        traffic.receive_again(record)
+    assert core.duplicated == {}
+    assert traffic.recovered == {'transitions': 1, 'composite_rewards': 1}

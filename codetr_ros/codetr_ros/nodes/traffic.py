@@ -14,7 +14,9 @@ from codetr_ros.nodes.peers import Ledger
 from codetr_ros.records import (
     TOPICS,
     Commit,
+    CompositeReward,
     Policy,
+    Preference,
     Presence,
     Record,
     RecordError,
@@ -33,6 +35,9 @@ KEPT_SECONDS = 10.0
 """How long they are kept."""
 PHASED = (Policy, Transitions, Commit, StepRewards)
 """Kinds of records of a phase that must have been permitted."""
+HELD_BACK = (*PHASED, CompositeReward, Preference)
+"""Kinds of records that a node which joins late may fetch again: what it took before would be
+counted as duplicated."""
 LATE_COMMITS = 16
 MOST_HELD = 4096
 """Records that are held back while a node joins."""
@@ -149,7 +154,7 @@ class Traffic:
                 self.receive(record)
 
     def _holds_back(self, record: Record) -> bool:
-        if self._held is None or not isinstance(record, PHASED):
+        if self._held is None or not isinstance(record, HELD_BACK):
             return False
         if len(self._held) >= MOST_HELD:
             raise RecordError(
