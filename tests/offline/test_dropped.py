@@ -3,7 +3,8 @@
 import pytest
 
 from codetr_ros.bags.reader import Bag
-from codetr_ros.offline.episodes import DROPPED, Index, stretches
+from codetr_ros.offline.cutting import stretches
+from codetr_ros.offline.episodes import DROPPED, Index
 from codetr_ros.offline.loading import load
 from codetr_ros.offline.phases import fold
 from codetr_ros.offline.replay import replay

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from codetr_ros.bags.reader import Bag
-from codetr_ros.offline import episodes
-from codetr_ros.offline.episodes import Index, stretches
+from codetr_ros.offline import cutting, episodes
+from codetr_ros.offline.cutting import stretches
+from codetr_ros.offline.episodes import Index
 from codetr_ros.offline.errors import FitError
 from helpers.builders import run, score, task_spec, tiny, transitions
 from helpers.foreign_bags import write
@@ -56,7 +57,7 @@ def test_chunks_make_an_episode_and_scores_may_come_before_their_steps(tmp_path)
     assert found.usable[0].segments.values.tolist() == [0.0, 7.0]
     assert (found.unscored, dict(found.skipped)) == (
         0,
-        {episodes.NO_STEPS: 0, episodes.TOO_LONG: 0},
+        {cutting.NO_STEPS: 0, cutting.TOO_LONG: 0},
     )
 
 
@@ -72,7 +73,7 @@ def test_a_segment_across_a_gap_is_left_out_and_what_lies_beyond_it_is_not(tmp_p
     found = stretches(index(tmp_path, [a, c, *scores((0, 7), (7, 7), (14, 7))]), 7, 100)
 
     assert spans(found.usable) == [(9, 12, [14])]
-    assert found.skipped[episodes.NO_STEPS] == 2
+    assert found.skipped[cutting.NO_STEPS] == 2
     assert found.unscored == 17 - 7
 
 
@@ -100,7 +101,7 @@ def test_a_step_counts_for_one_score_only(tmp_path):
     found = stretches(index(tmp_path, [a, *scores((0, 7), (0, 7), (5, 7), (7, 3))]), 7, 100)
 
     assert spans(found.usable) == [(0, 14, [0, 7])]
-    assert found.skipped[episodes.OVERLAP] == 2
+    assert found.skipped[cutting.OVERLAP] == 2
 
 
 def test_a_score_of_more_steps_than_the_delay_is_left_out(tmp_path):
@@ -108,7 +109,7 @@ def test_a_score_of_more_steps_than_the_delay_is_left_out(tmp_path):
     found = stretches(index(tmp_path, [a, *scores((0, 9), (9, 4))]), 7, 100)
 
     assert spans(found.usable) == [(0, 14, [9])]
-    assert found.skipped[episodes.TOO_LONG] == 1
+    assert found.skipped[cutting.TOO_LONG] == 1
 
 
 def test_a_long_episode_is_cut_between_segments_and_loses_none(tmp_path):

@@ -9,7 +9,8 @@ import torch
 
 from codetr_ros.bags.reader import Bag
 from codetr_ros.offline import fitting
-from codetr_ros.offline.episodes import Index, stretches
+from codetr_ros.offline.cutting import stretches
+from codetr_ros.offline.episodes import Index
 from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.judging import judge
 from codetr_ros.offline.loading import load, newest

@@ -141,7 +141,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def _epochs(arguments: Sequence[str], given: Arguments) -> int:
     from codetr_ros.offline import fitting, judging, report, results
-    from codetr_ros.offline.episodes import stretches
+    from codetr_ros.offline.cutting import stretches
     from codetr_ros.rewards import saved
     from codetr_ros.runs import checkpoints
 
@@ -230,7 +230,7 @@ def _refuse_unfit(settings: Settings) -> None:
 
 def _phases(arguments: Sequence[str], given: Arguments) -> int:
     from codetr_ros.offline import judging, loading, phases, report, results, sources
-    from codetr_ros.offline.episodes import stretches
+    from codetr_ros.offline.cutting import stretches
 
     if len(given.bags) != 1:
         raise FitError(

@@ -20,7 +20,7 @@ import torch
 
 from codetr_ros.bags.reader import Bag
 from codetr_ros.config import Settings
-from codetr_ros.offline.episodes import Stretch
+from codetr_ros.offline.cutting import Stretch
 from codetr_ros.offline.errors import FitError
 from codetr_ros.offline.loading import Loaded, load
 from codetr_ros.offline.settings import FitSettings

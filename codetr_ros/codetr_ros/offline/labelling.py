@@ -22,7 +22,8 @@ from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.schemas import Definition
 from codetr_ros.bags.topics import BagTopic, schema_text, type_hash
 from codetr_ros.bags.unfinished import unfinished
-from codetr_ros.offline.episodes import Index, Key, Stretch, stretches
+from codetr_ros.offline.cutting import Stretch, stretches
+from codetr_ros.offline.episodes import Index, Key
 from codetr_ros.offline.judging import labels_of
 from codetr_ros.offline.loading import load
 from codetr_ros.records import MESSAGE_BYTES, TOPICS, StepRewards

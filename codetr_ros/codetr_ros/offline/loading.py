@@ -9,7 +9,8 @@ import numpy as np
 from codetr_ros.bags.dropped import undropped_entries
 from codetr_ros.bags.reader import Bag
 from codetr_ros.memory.trajectories import Trajectories
-from codetr_ros.offline.episodes import Key, Stretch, sound
+from codetr_ros.offline.cutting import Stretch
+from codetr_ros.offline.episodes import Key, sound
 from codetr_ros.offline.errors import FitError
 from codetr_ros.records import F32, CompositeReward, Transitions, TrueRewards
 

@@ -12,7 +12,8 @@ from rich.console import Console
 
 from codetr_ros.bags.reader import Bag
 from codetr_ros.config import Settings
-from codetr_ros.offline.episodes import Index, Stretches
+from codetr_ros.offline.cutting import Stretches
+from codetr_ros.offline.episodes import Index
 from codetr_ros.offline.fitting import Fitted
 from codetr_ros.offline.judging import MEASURES, Judgement
 from codetr_ros.offline.phases import Fold
