@@ -3,7 +3,7 @@
 import pytest
 
 from codetr_ros import cli
-from codetr_ros.cli import demo_robot, train
+from codetr_ros.cli import demo_robot, train_over_topics
 from codetr_ros.nodes import signing
 from helpers.builders import tiny
 
@@ -38,6 +38,6 @@ def test_what_cannot_be_started_is_refused(flags, said, capsys, tmp_path):
 
 
 def test_the_inspection_of_the_robot_signs_with_the_key_that_the_nodes_of_the_run_have():
-    topics = train.Topics()
+    topics = train_over_topics.Topics()
     given = demo_robot.beside(tiny(), topics.key)
     assert signing.key_of(given) == signing.key_of(topics.key) is not None

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import tyro
 
 from codetr_ros import config
-from codetr_ros.cli import beside, demo_run, refuse, train
+from codetr_ros.cli import beside, demo_run, refuse, train, train_over_topics
 from codetr_ros.cli.terminal import console, parse_arguments
 from codetr_ros.config import SettingsError
 from codetr_ros.processes.launcher import LaunchError
@@ -69,7 +69,9 @@ def main(arguments: Sequence[str]) -> int:
         return refuse(str(error))
     offered = beside.Offered(watch=True, score=NAME, open=given.open)
     shown = train.Shown(film=True, offered=offered)
-    code = train.train(settings, run_id, folder, train.Topics(), 'codetr demo person', shown)
+    code = train.train(
+        settings, run_id, folder, train_over_topics.Topics(), 'codetr demo person', shown
+    )
     if code == 0:
         for line in told(folder):
             console().print(line, markup=False)

@@ -74,11 +74,11 @@ def _example() -> Path | None:
 
 
 def _run(settings: Settings, run_id: str, folder: Path, example: Path) -> int:
-    from codetr_ros.cli import train
+    from codetr_ros.cli import train, train_over_topics
 
     shown = console()
     others = _robot_and_inspection(settings, launcher.namespace_of(run_id), folder, example)
-    topics = train.Topics(
+    topics = train_over_topics.Topics(
         robot={'mapping': str(example / 'live.yaml'), 'autostart': True},
     )
     with launcher.Processes(lambda text: shown.print(text, markup=False)) as processes:

@@ -13,73 +13,49 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from codetr_ros import config
-from codetr_ros.cli import FAILED, INTERRUPTED, beside, refuse, results, resume, train_in_process
+from codetr_ros.cli import (
+    FAILED,
+    INTERRUPTED,
+    beside,
+    refuse,
+    results,
+    resume,
+    train_in_process,
+    train_over_topics,
+)
 from codetr_ros.cli.audience import Audience
 from codetr_ros.cli.flags import parse
 from codetr_ros.cli.outcome import Outcome
 from codetr_ros.cli.terminal import console
-from codetr_ros.cli.train_flags import FLAGS, PEER_DEADLINE, wrong
+from codetr_ros.cli.train_flags import FLAGS, wrong
+from codetr_ros.cli.train_over_topics import Topics
 from codetr_ros.config import Settings, SettingsError
-from codetr_ros.nodes import signing
-from codetr_ros.nodes.silence import LEAVE_OUT_AFTER
 from codetr_ros.processes import launcher
 from codetr_ros.processes.launcher import LaunchError
 from codetr_ros.processes.openmp import crowded, threading_environment
-from codetr_ros.processes.restarts import Restarts, may_be_started_again
+from codetr_ros.processes.restarts import Restarts
 from codetr_ros.processes.supervise import (
     Interrupts,
-    Silence,
-    is_over,
-    supervise,
-    why_it_gave_up,
 )
-from codetr_ros.records import Record
-from codetr_ros.records.roles import TABLE
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import origin
-from codetr_ros.runs import reports as node_reports
 from codetr_ros.runs.folder import RunFolderError
 from codetr_ros.runs.live import Live
 from codetr_ros.runs.middle import Middle
 from codetr_ros.runs.origin import Origin, held
 from codetr_ros.runs.progress import Progress
 from codetr_ros.runs.report_text import evaluations_missing
-from codetr_ros.runs.reports import NodeReport
 from codetr_ros.runs.summary import Summary
 from codetr_ros.runs.tensorboard import Events
 
 if TYPE_CHECKING:
-    from codetr_ros.ros.watch import Watcher
+    pass
 
 DESCRIPTION = """Train on a task.
 
 Starts a simulator, an evaluator, the reward model, the learner and a recorder as ROS 2 nodes in a
 namespace of their own, shows their progress, and ends with a summary, a report and a picture.
 Ctrl-C ends all of it cleanly. Every setting is a flag; --config sets their defaults."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Topics:
-    """How the nodes of a run are started.
-
-    Attributes:
-        namespace: that of the nodes; None: one of the run's own.
-        peer_deadline: seconds that they wait for each other; 0: for ever.
-        leave_out_after: seconds of silence after which a simulator of several is left out; 0:
-            never.
-        start: starts each.
-        robot: parameters of the robot node, where the task is that of a robot.
-        restarts: how often one that was killed is started again.
-        key: the variable with the key of the run, for all that takes part in it.
-    """
-
-    namespace: str | None = None
-    peer_deadline: float = PEER_DEADLINE
-    leave_out_after: float = LEAVE_OUT_AFTER
-    start: launcher.Start = launcher.start_program
-    robot: Mapping[str, str | bool] | None = None
-    restarts: Restarts = dataclasses.field(default_factory=Restarts)
-    key: Mapping[str, str] = dataclasses.field(default_factory=signing.environment, repr=False)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,33 +89,11 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
         folder: Path | None = extra['resume']
         begun = None if folder is None else resume.check(folder, settings, extra)
         in_process = extra['in_process'] if begun is None else begun.in_process
-        if settings.method in config.IN_PROCESS_ONLY and not in_process:
-            return refuse(
-                f'--method {settings.method} {config.IN_PROCESS_ONLY[settings.method]}: '
-                'it runs in process only. Add --in-process, or choose another --method'
-            )
+        if reason := _does_not_fit(settings, extra, in_process):
+            return refuse(reason)
         if in_process:
             # before torch is imported: the threads of the nodes, for the same results bit for bit
             os.environ.update(threading_environment(settings))
-        if in_process and settings.scorer in ('person', 'topic'):
-            return refuse(
-                f'--scorer {settings.scorer} with --in-process: scores come over topics, which it '
-                'does without; leave out --in-process, or take --scorer simulated'
-            )
-        if extra['score_service'] and not settings.scored_elsewhere:
-            return refuse(
-                f'--score-service with --scorer {settings.scorer}: nobody else can score; add '
-                '--scorer topic'
-            )
-        if extra['camera'] and settings.scorer != 'person':
-            return refuse(
-                f'--camera with --scorer {settings.scorer}: no page to score is served; add '
-                '--scorer person'
-            )
-        if extra['score_service'] and in_process:
-            return refuse(
-                '--score-service with --in-process: services need nodes; leave out one of them'
-            )
         tasks.check(settings, tasks.find(settings.task))
         if not in_process:
             for role in settings.roles:
@@ -153,7 +107,7 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
         if in_process:
             tryout.here(settings)
         else:
-            _watcher(settings)
+            train_over_topics.watcher(settings)
             tryout.apart(settings, launcher.environment(settings))
         if folder is None:
             folder = run_folder.create(out) if extra['out'] else run_folder.create_next(out)
@@ -188,6 +142,33 @@ def main(arguments: Sequence[str], start: launcher.Start = launcher.start_progra
             return train(settings, run_id, folder, topics, command, shown, extra['bag'], begun)
     except RunFolderError as error:
         return refuse(str(error))
+
+
+def _does_not_fit(settings: Settings, extra: Mapping[str, Any], in_process: bool) -> str | None:
+    """Why flags and settings do not fit each other; None: they do."""
+    if settings.method in config.IN_PROCESS_ONLY and not in_process:
+        return (
+            f'--method {settings.method} {config.IN_PROCESS_ONLY[settings.method]}: '
+            'it runs in process only. Add --in-process, or choose another --method'
+        )
+    if in_process and settings.scorer in ('person', 'topic'):
+        return (
+            f'--scorer {settings.scorer} with --in-process: scores come over topics, which it '
+            'does without; leave out --in-process, or take --scorer simulated'
+        )
+    if extra['score_service'] and not settings.scored_elsewhere:
+        return (
+            f'--score-service with --scorer {settings.scorer}: nobody else can score; add '
+            '--scorer topic'
+        )
+    if extra['camera'] and settings.scorer != 'person':
+        return (
+            f'--camera with --scorer {settings.scorer}: no page to score is served; add '
+            '--scorer person'
+        )
+    if extra['score_service'] and in_process:
+        return '--score-service with --in-process: services need nodes; leave out one of them'
+    return None
 
 
 def _topics(extra: Mapping[str, Any], namespace: str | None, start: launcher.Start) -> Topics:
@@ -277,7 +258,7 @@ def train(
             way = (
                 partial(train_in_process.run, bag=bag, resumed=begun is not None)
                 if topics is None
-                else partial(_over_topics, topics)
+                else partial(train_over_topics.run, topics=topics)
             )
             outcome = way(settings, run_id, folder, audience, interrupts)
         if outcome.refused:
@@ -307,102 +288,6 @@ def train(
     if outcome.interrupted:
         return INTERRUPTED
     return FAILED if outcome.failure else 0
-
-
-def _watcher(settings: Settings) -> 'type[Watcher]':
-    """What watches the nodes of a run.
-
-    Raises:
-        LaunchError: ROS cannot be imported.
-    """
-    # it lives in this process and must look for the nodes where they are
-    environment = launcher.environment(settings).items()
-    os.environ.update({n: v for n, v in environment if n.startswith(('ROS_', 'RMW_'))})
-    try:
-        from codetr_ros.ros.watch import Watcher
-    except ImportError as error:
-        raise LaunchError(
-            f'ROS cannot be imported ({error}): `codetr doctor` names what is missing; '
-            '--in-process trains without ROS'
-        ) from error
-    return Watcher
-
-
-def _over_topics(
-    topics: Topics,
-    settings: Settings,
-    run_id: str,
-    folder: Path,
-    audience: Audience,
-    interrupts: Interrupts,
-) -> Outcome:
-    namespace = topics.namespace or launcher.namespace_of(run_id)
-    commands = launcher.commands(
-        settings,
-        run_id,
-        folder,
-        namespace=namespace,
-        peer_deadline=topics.peer_deadline,
-        leave_out_after=topics.leave_out_after,
-        robot=topics.robot,
-    )
-    watch = _watcher(settings)
-    environment = launcher.environment(settings) | dict(topics.key)
-    silence, summary, progress = Silence(), audience.summary, audience.progress
-
-    def receive(record: Record) -> None:
-        silence.receive(record)
-        audience.receive(record)
-
-    failure = None
-    asked = interrupts.again
-    with launcher.Processes(progress.log, asked, start_program=topics.start) as processes:
-        try:
-            # The watcher comes first, so as to receive everything from the nodes' start on.
-            with watch(receive, namespace, key=signing.key_of(environment)) as watcher:
-
-                def poll() -> None:
-                    watcher.poll(0.1)
-                    audience.tick()
-
-                processes.start(commands, folder / run_folder.LOGS, environment)
-                failure = supervise(
-                    processes,
-                    poll,
-                    interrupts,
-                    silence,
-                    lambda node: why_it_gave_up(node, folder),
-                    restarts=topics.restarts,
-                    over=lambda node: is_over(node, folder),
-                    dispensable=lambda node: _can_do_without(node, summary),
-                )
-                watcher.poll(0.0)  # the last messages of the last node
-        except LaunchError as error:
-            failure = str(error)
-    reports = node_reports.read_all(folder)
-    for node in processes.nodes:
-        key = run_folder.report_path(folder, node.role, node.name).stem
-        known = reports.get(key) or NodeReport(role=node.role, name=node.name)
-        reports[key] = known.model_copy(
-            update={'exit_code': node.code, 'restarts': topics.restarts.counts[node.name]}
-        )
-    summary.end()
-    interrupted = bool(interrupts.count)
-    if (folder / run_folder.BAG).exists():  # else no recorder started, and the failure names it
-        progress.log('reading the bag for the summary')
-        before = interrupts.count
-        bag = folder / run_folder.BAG
-        results.complete(summary, bag, progress.log, lambda: interrupts.count > before)
-    culprit = next((node.log for node in processes.nodes if node.unasked_failure), None)
-    return Outcome(reports, interrupted, failure, culprit)
-
-
-def _can_do_without(node: launcher.Node, summary: Summary) -> bool:
-    """Whether a run goes on without a node that has failed for good. Nobody begins before all are
-    there: one that fails with a reason before the first commit has none to wait for.
-    """
-    begun = summary.phases > 0 or may_be_started_again(node.code) or node.code is None
-    return begun and TABLE[node.role].dispensable
 
 
 def show_failure(outcome: Outcome) -> None:
