@@ -23,7 +23,7 @@ SETTINGS = tiny(
     steps=1600, sac__updates_per_step=0.2, evaluate_every=400, threads=1, record_relabels='first'
 )
 ENVIRONMENT = os.environ | {'COLUMNS': '160'}
-OF_TIME = {'run_id', 'began', 'command', 'wall_s', 'steps_per_s', 'bag', 'processes'}
+OF_TIME = {'run_id', 'began', 'command', 'wall_s', 'steps_per_s', 'bag', 'processes', 'spent'}
 
 
 def done(settings, folder):

@@ -177,7 +177,10 @@ def _base(keys: _Keys, path: Path) -> Settings:
             f'{source}.{decided[0]} = {changes[decided[0]]!r}: the key {_AXES[decided[0]]} of '
             'the spec decides it; remove one of them'
         )
-    settings = config.load(name).changed(changes, source)
+    # with the first of each list: some settings fit only the methods of their spec
+    lists = {axis: key for axis, key in _AXES.items() if axis != 'steps'}
+    first = {axis: getattr(keys, key)[0] for axis, key in lists.items()}
+    settings = config.load(name).changed(first | {'steps': keys.steps} | changes, source)
     if not settings.evaluate_every:
         raise BenchmarkError(
             f'{source}.evaluate_every = 0: a run without evaluations has no score; give the steps '

@@ -46,6 +46,7 @@ class Member:
     published: Counter[str] = field(default_factory=Counter)
     received: Counter[str] = field(default_factory=Counter)
     seconds: float = 0.0
+    processor_seconds: float = 0.0
 
 
 class Parts:
@@ -129,9 +130,10 @@ class Parts:
     def given_by(self, name: str) -> list[Record] | None:
         """What a part yields after a slice of its work; None if there is nothing to do."""
         member = self.members[name]
-        began = time.perf_counter()
+        began, processor = time.perf_counter(), time.process_time()
         records = next(member.work)
         member.seconds += time.perf_counter() - began
+        member.processor_seconds += time.process_time() - processor
         self._tick()
         return None if records is None else list(records)
 
@@ -194,7 +196,7 @@ class Parts:
                 published=+member.published,
                 received=+member.received,
                 refused={},
-                cpu_s=member.seconds,
+                cpu_s=member.processor_seconds,
                 wall_s=member.seconds,
                 finished=member.core.finished,
                 error=None,

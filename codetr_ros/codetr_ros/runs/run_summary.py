@@ -59,6 +59,16 @@ class RewardRecovery(Facts):
     inferred_std: Number = Field(None, description='their standard deviation')
 
 
+class Spent(Facts):
+    """The processor time that a run in one process had taken at an evaluation."""
+
+    step: int = Field(description='training steps that the policy has learnt from')
+    cpu_s: float = Field(
+        description='processor time of all its parts and of all evaluations until then, this one '
+        'included; without the start of the process [s]'
+    )
+
+
 class MessageCounts(Facts):
     """The numbers of messages that a topic carried, and what became of them."""
 
@@ -166,6 +176,11 @@ class RunSummary(Facts):
     reward_recovery: list[RewardRecovery] = Field(
         [],
         description='a row for each evaluation with labels; the first summaries lack it',
+    )
+    spent: list[Spent] = Field(
+        [],
+        description='a row for each evaluation of a run that one process ran from its beginning; '
+        'none otherwise, and in the first summaries',
     )
     label_unit: Number = Field(
         None,

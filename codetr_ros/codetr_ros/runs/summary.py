@@ -26,6 +26,7 @@ from codetr_ros.runs.recovery import Recovery
 from codetr_ros.runs.reports import NodeReport
 from codetr_ros.runs.run_summary import Evaluation, GivenScores, RewardRecovery, RunSummary
 from codetr_ros.runs.segments import Segment
+from codetr_ros.runs.spent import ProcessorTime
 from codetr_ros.runs.tallies import count_messages, processes
 from codetr_ros.system import modules
 from codetr_ros.system.files import atomic_write
@@ -112,6 +113,7 @@ class Summary:
         self._before = 0  # steps of the run before its time began
         self._recovery = Recovery(settings, not in_process if recorded is None else recorded)
         self._leavers = Leavers()
+        self._processor = ProcessorTime() if in_process else None
         self.scores_given: list[GivenScores] = []  # from the bag
         self._wall: float | None = None  # seconds that the run took, once it is over
 
@@ -124,6 +126,8 @@ class Summary:
             RecoveryError: labels come before some of the true rewards of their steps.
         """
         self._recovery.receive(record)
+        if self._processor is not None:
+            self._processor.receive(record)
         if isinstance(record, EpisodeResult):
             if record.purpose == 'training':
                 # step 1000 of 1000-step phases ends phase 0
@@ -160,6 +164,8 @@ class Summary:
     def go_on(self) -> None:
         """Note that all received so far is of an earlier time: the run goes on from here."""
         self._before = self.steps
+        if self._processor is not None:
+            self._processor.go_on()
 
     def end(self, wall_s: float | None = None) -> None:
         """End the time of the run; records may still come.
@@ -278,6 +284,7 @@ class Summary:
             evaluations_missing=self._evaluations_missing(),
             random=random,
             reward_recovery=self._reward_recovery(),
+            spent=self._processor.rows() if self._processor is not None else [],
             label_unit=self.label_unit,
             random_score=random.score_mean if random else None,
             final_score=last.score_mean if last else None,
