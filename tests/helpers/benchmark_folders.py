@@ -11,7 +11,7 @@ from codetr_ros.benchmark import spec
 from codetr_ros.benchmark.folder import Folder, session
 from codetr_ros.benchmark.spec import Cell
 from codetr_ros.runs import run_summary
-from codetr_ros.runs.run_summary import Evaluation, RewardRecovery, RunSummary
+from codetr_ros.runs.run_summary import Evaluation, RewardRecovery, RunSummary, Spent
 from codetr_ros.runs.summary import Summary
 
 Score = Callable[[Cell], float | str | None]
@@ -95,6 +95,7 @@ def _summary(cell: Cell, score: float) -> RunSummary:
             'final_true_return': 1000 * score,
             'wall_s': 12.5,
             'evaluations': evaluations,
+            'spent': [Spent(step=step, cpu_s=step / 100) for step in steps],
             'reward_recovery': recovery if cell.settings.method == 'codetr' else [],
         }
     )

@@ -1,15 +1,13 @@
 """The report of a benchmark: one page with tables and pictures, in HTML and Markdown, and CSV."""
 
-import csv
-import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from codetr_ros.benchmark import anchors as trivial
-from codetr_ros.benchmark import curves, scores, sections, table
+from codetr_ros.benchmark import curves, files, scores, sections, standing_rows, table
 from codetr_ros.benchmark.folder import Folder
 from codetr_ros.benchmark.results import Result, read
+from codetr_ros.benchmark.standings import standings
 from codetr_ros.config import delay_in_words
 from codetr_ros.runs.document import Block, Heading, markdown, page, plain
 from codetr_ros.simulation import tasks
@@ -50,9 +48,11 @@ def write(paths: Sequence[Path], out: Path | None = None) -> tuple[Path, str]:
         *scores.own(together, alone, anchors),
         *scores.returns(together, alone),
     ]
+    standing = standings(results, anchors)
     beside = scores.beside_the_paper(in_span)
     blocks: list[Block] = [
         *head,
+        *standing_rows.blocks(standing),
         *numbers,
         *scores.interquartile(table.aggregate(each), each),
         *scores.anchors(anchors),
@@ -67,8 +67,10 @@ def write(paths: Sequence[Path], out: Path | None = None) -> tuple[Path, str]:
     atomic_write(folder / 'table.md', markdown(blocks))
     atomic_write(folder / 'index.html', page(blocks))
     several = [row for row in together if len(row.delays) > 1]
-    atomic_write(folder / 'table.csv', table_csv([*several, *alone]))
-    atomic_write(folder / 'cells.csv', cells_csv(results))
+    atomic_write(folder / 'table.csv', files.table([*several, *alone]))
+    atomic_write(folder / 'standings.csv', files.standings(standing))
+    atomic_write(folder / 'cells.csv', files.cells(results))
+    atomic_write(folder / 'evaluations.csv', files.evaluations(results))
     return folder, plain([*head, *numbers, *beside])
 
 
@@ -90,72 +92,3 @@ def _pictures(results: Sequence[Result], anchors: trivial.Anchors) -> Iterator[t
         picture = curves.recovery_curves(some, order, f'Reward recovery. {title}')
         if picture is not None:
             yield f'recovery_{name}.png', picture
-
-
-def table_csv(rows: Sequence[table.Row]) -> str:
-    """A line for each method in each row, over several delays and for each delay alone."""
-    lines: list[dict[str, Any]] = []
-    for row in rows:
-        for entry in row.entries:
-            low, high = entry.interval or (None, None)
-            lines.append(
-                {
-                    'task': row.task,
-                    'composite': row.composite,
-                    'delays': ' '.join(map(str, row.delays)),
-                    'method': entry.method,
-                    'score_mean': entry.mean,
-                    'score_spread': entry.spread,
-                    'score_iqm': entry.iqm,
-                    'score_iqm_low': low,
-                    'score_iqm_high': high,
-                    'return_mean': entry.return_mean,
-                    'return_spread': entry.return_spread,
-                    'best': int(entry.best),
-                    'bold': int(entry.bold),
-                    'p': entry.p,
-                    'pairs': entry.pairs,
-                    'cells': len(entry.scores),
-                    'cells_planned': entry.planned,
-                    'cells_failed': entry.failed,
-                }
-            )
-    return _csv(lines)
-
-
-def cells_csv(results: Sequence[Result]) -> str:
-    """A line for each cell, whatever its state."""
-    return _csv(
-        [
-            {
-                'cell': r.cell,
-                'task': r.task,
-                'composite': r.composite,
-                'delay': r.delay,
-                'method': r.method,
-                'seed': r.seed,
-                'state': r.state,
-                'score': r.score,
-                'true_return': r.true_return,
-                'within_pearson': _last_within(r),
-                'wall_s': r.summary.wall_s if r.summary else None,
-                'commit': r.commit,
-                'error': r.error,
-            }
-            for r in results
-        ]
-    )
-
-
-def _last_within(result: Result) -> float | None:
-    rows = result.reward_recovery
-    return rows[-1].within if rows else None
-
-
-def _csv(lines: Sequence[dict[str, Any]]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(lines[0]), lineterminator='\n')
-    writer.writeheader()
-    for line in lines:
-        writer.writerow({k: repr(v) if isinstance(v, float) else v for k, v in line.items()})
-    return text.getvalue()

@@ -1,4 +1,6 @@
-"""The few statistics of a table: spread, paired t-test, interquartile mean and its interval."""
+"""The few statistics of a table: spread, paired t-test and its correction, interquartile mean and
+its interval.
+"""
 
 from collections.abc import Sequence
 
@@ -29,6 +31,24 @@ def paired_p(a: Sequence[float], b: Sequence[float]) -> float | None:
     from scipy import stats
 
     return float(stats.ttest_rel(a, b).pvalue)
+
+
+def holm(p: Sequence[float]) -> list[float]:
+    """p-values of several tests, corrected so that any false one among them is as rare as the
+    level says (Holm 1979, "A simple sequentially rejective multiple test procedure").
+
+    Args:
+        p: of each test.
+
+    Returns:
+        The corrected ones in the same order, at most 1.
+    """
+    corrected = [0.0] * len(p)
+    highest = 0.0
+    for rank, i in enumerate(sorted(range(len(p)), key=lambda i: p[i])):
+        highest = max(highest, min(1.0, (len(p) - rank) * p[i]))
+        corrected[i] = highest
+    return corrected
 
 
 def interquartile_mean(values: Sequence[float]) -> float:

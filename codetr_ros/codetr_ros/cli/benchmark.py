@@ -54,7 +54,7 @@ class Run:
 class Report:
     """Make a report of one or several benchmarks: tables, pictures and failures.
 
-    Writes index.html, table.md, table.csv, cells.csv and pictures.
+    Writes index.html, table.md, pictures, and CSV files: table, standings, cells, evaluations.
     """
 
     folders: Annotated[
