@@ -70,7 +70,7 @@ def test_recorder_and_simulators_go_on_behind_steps_that_were_dropped(made):
         for simulator in simulators:
             simulator.restore(record)
     due = left.commit.phase + 1
-    assert (recorder.phase, recorder.absent) == (due, frozenset())
+    assert (recorder.phase, recorder.left_out) == (due, frozenset())
     steps = np.array(settings.shares_of(due), np.uint32)
     permit = policy(run_id=run.run_id, phase=due, sources=BOTH, steps=steps)
     recorder.receive(permit)

@@ -122,6 +122,7 @@ def test_help_shows_the_defaults_and_ranges_of_the_chosen_config(
         ('--device gpu', "device = 'gpu': must be cpu, or a GPU: cuda, or cuda and its number"),
         ('--namespace lab', "--namespace 'lab' must be a ROS namespace: /name"),
         ('--namespace /lab --in-process', '--in-process starts none: leave out one of them'),
+        ('--joiners arm_2 --in-process', 'nobody joins a run without nodes; leave out one'),
         ('--camera /a', '--camera with --scorer simulator: no page to score is served'),
         ('--score-service', '--score-service with --scorer simulator: nobody else can score'),
         ('--peer-deadline -1', '--peer-deadline -1 must be from 0 to 86400 seconds'),

@@ -14,7 +14,7 @@ from codetr_ros.runs.reports import NodeReport
 from codetr_ros.runs.summary import Summary
 from helpers.bags import ours
 from helpers.benchmark_folders import benchmark
-from helpers.builders import run
+from helpers.builders import run, tiny
 from helpers.summaries import REPORTED, SETTINGS, Clock, a_run
 
 FILES = (run_folder.SUMMARY, run_folder.METRICS, run_folder.REPORT, run_folder.PICTURE)
@@ -100,6 +100,19 @@ def test_nodes_that_gave_up_or_were_stopped_are_a_failure_or_an_interruption(fol
     assert cli.main(['report', '--no-film', str(folder)]) == 0
     said = summary_of(folder)['failure']
     assert said == 'record: sim is silent; learner: training has diverged', 'the first one first'
+
+
+def test_a_simulator_that_has_left_the_run_is_neither_failure_nor_interruption():
+    settings = tiny(joiners=('arm_2',))
+    left = NodeReport(role='sim', name='arm_2', finished=False)
+    for error in (None, 'no room'):
+        gone = {'sim-arm_2': left.model_copy(update={'error': error})}
+        needed = report._needed(settings, gone)
+        assert (report._interrupted(needed), report._failure(needed)) == (False, None)
+        gone['sim-sim'] = gone['sim-arm_2'].model_copy(update={'name': 'sim'})
+        needed = report._needed(settings, gone)
+        why = None if error is None else 'sim: no room'
+        assert (report._interrupted(needed), report._failure(needed)) == (error is None, why)
 
 
 def test_the_bag_of_a_killed_recorder_is_read_as_far_as_it_goes(folder, capsys):

@@ -71,10 +71,15 @@ class Nodes:
         self.folder = run_folder.create(folder)
         run_folder.write_settings(folder, settings)
         made = launcher.commands(settings, RUN_ID, folder, peer_deadline=PEER_DEADLINE)
+        self.names = tuple(command.name for command in made)
+        first = next(command for command in made if command.role == 'sim')
+        made += [
+            launcher.Command(name, 'sim', (*first.arguments, '-r', f'__node:={name}'))
+            for name in settings.joiners
+        ]
         self._commands = {command.name: command for command in made}
         self._environment = launcher.environment(settings) | ({VARIABLE: key} if key else {})
         self._processes = launcher.Processes(print, start_program=start)
-        self.names = tuple(self._commands)
 
     def role(self, name: str) -> str:
         """The role of a node."""

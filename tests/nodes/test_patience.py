@@ -134,3 +134,36 @@ def test_a_run_whose_evaluator_has_given_up_ends_well():
     settling = Settling('/r/record', peers, Limit(DEADLINE))
     assert settling.check({}, 1.0, 200.0) == (True, 'has finished')
     assert settling.without == ['evaluate /r/evaluate']
+
+
+@pytest.mark.parametrize(
+    'last',
+    [{}, {'finished': True, 'doing': 'has finished'}],
+    ids=['is silent', 'has ended'],
+)
+def test_nobody_gives_up_because_of_a_simulator_that_was_left_out(last):
+    """While the others work, however long that takes."""
+    settings = tiny(simulators=1, joiners=('arm_2',))
+    for left_out in ((), ('arm_2',)):
+        peers = Peers('record')
+        peers.note(presence('sim'), 199.0)
+        peers.note(presence('learner'), 199.0)
+        peers.note(presence('sim', node='/r/arm_2', instance_id='arm_2', **last), 50.0)
+        patience = Patience(
+            '/r/record', peers, ['policy', 'transitions'], Limit(DEADLINE), Log(),
+            left_out=lambda peer, out=left_out: peer.left_out(settings, out),
+        )  # fmt: skip
+        if left_out:
+            patience.check(200.0, 100.0, 'waits for a permission', {})
+        else:
+            with pytest.raises(NodeError, match='sim /r/arm_2'):
+                patience.check(200.0, 100.0, 'waits for a permission', {})
+
+
+def test_all_environments_of_a_simulator_must_be_left_out():
+    settings = tiny(simulators=2, envs=2)
+    peers = Peers('record')
+    peers.note(presence('sim', node='/r/sim_2'), 0.0)
+    (peer,) = peers.newest()
+    assert not peer.left_out(settings, ['sim_2-1'])
+    assert peer.left_out(settings, ['sim_2-1', 'sim_2-2'])

@@ -1,9 +1,11 @@
 """Which nodes of a run are there, have ended, or have given up."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from codetr_ros.nodes.peers import Peers
+from codetr_ros.nodes.peers import GAVE_UP, Peers
 from codetr_ros.records import Presence
 from helpers.builders import tiny
 
@@ -75,3 +77,34 @@ def test_a_last_presence_is_the_last_even_if_an_earlier_one_arrives_after_it():
     for finished in (False, True, False):
         peers.note(presence('sim', 'hash', finished), 0.0)
     assert not peers.anybody_left()
+
+
+def simulator(name, **changes):
+    return replace(presence('sim', 'hash', False), node=f'/r/{name}', instance_id=name, **changes)
+
+
+def test_a_simulator_that_may_join_takes_the_place_of_none_that_must_be_there():
+    settings = tiny(joiners=('arm_2',))
+    peers = Peers('record')
+    peers.know(settings, 'record')
+    peers.note(simulator('arm_2'), 0.0)
+    assert any(missing.startswith('sim') for missing in peers.absent(settings, 'hash'))
+    peers.note(simulator('sim'), 0.0)
+    assert not any(missing.startswith('sim') for missing in peers.absent(settings, 'hash'))
+    own = Peers('sim')
+    own.know(settings, 'arm_2')
+    assert any(missing.startswith('sim') for missing in own.absent(settings, 'hash'))
+
+
+def test_a_simulator_that_comes_and_goes_may_die_without_failing_the_run():
+    settings = tiny(joiners=('arm_2',))
+    peers = Peers('record')
+    peers.know(settings, 'record')
+    for name in ('sim', 'arm_2'):
+        peers.note(simulator(name), 0.0)
+    last = {'finished': True, 'settings_hash': '', 'doing': f'{GAVE_UP}no room'}
+    peers.note(simulator('arm_2', **last), 1.0)
+    assert (peers.failed(), peers.cause()) == ([], '')
+    peers.note(simulator('sim', **last), 2.0)
+    assert peers.failed() == ['sim /r/sim has given up (no room)']
+    assert peers.cause() == 'no room'

@@ -17,6 +17,7 @@ from codetr_ros.records import (
     Policy,
     Preference,
     Record,
+    TaskSpec,
     Transitions,
     TrueRewards,
 )
@@ -26,24 +27,29 @@ from codetr_ros.records.numbering import Judgement
 
 NAMED = (Policy, Transitions, CompositeReward, Preference, Commit)
 """The kinds of records that belong to a phase by their number or by its commit."""
-ON_REQUEST = (TrueRewards,)
-"""Those that are read where they are asked for. They may come late: one that came after the commit
-is not among them."""
+ON_REQUEST = (TrueRewards, TaskSpec)
+"""Those that are read where they are asked for. True rewards may come late: those that came after
+the commit are not among them. An announcement belongs to the phase that was committed next."""
 
 
 @dataclass(frozen=True)
 class _Phase:
-    """A committed phase: its commit, the one before, and the chunks that hold it."""
+    """A committed phase: its commit, the one before, the chunks that hold it, and the sources that
+    announced themselves between the two.
+    """
 
     commit: Commit
     before: Commit | None
     begin: Place
     end: Place
+    announced: frozenset[str]
 
     def holds(self, record: Record) -> bool:
         """Whether a record belongs to the phase."""
         if isinstance(record, (Policy, Commit)):
             return record.phase == self.commit.phase
+        if isinstance(record, TaskSpec):
+            return record.source in self.announced
         if isinstance(record, (Transitions, TrueRewards)):
             of, name = ('sources', 'transitions'), record.source
         elif isinstance(record, Judgement):
@@ -69,6 +75,7 @@ class Phases:
         self._begins: dict[int, tuple[int, Place]] = {}  # of phases that are not committed
         # judgements that no commit has named: they may have come long before it
         self._judged: dict[tuple[str, int], tuple[int, Place]] = {}
+        self._announced: dict[str, tuple[int, Place]] = {}  # since the last commit
         self._noted = 0  # records: puts places in the order of the bag
         self._described: dict[Path, McapChannels] = {}
         self.newest: int | None = None
@@ -85,15 +92,23 @@ class Phases:
             self._begins.setdefault(record.phase, (self._noted, place))
         elif isinstance(record, Judgement):
             self._judged.setdefault((record.scorer, record.sequence), (self._noted, place))
+        elif isinstance(record, TaskSpec):
+            self._announced.setdefault(record.source, (self._noted, place))
         elif isinstance(record, Commit) and record.phase not in self._phases:
             phase = record.phase
             before = self._phases.get(phase - 1)
-            begins = [self._begins.pop(phase, (self._noted, place)), *self._named(record)]
+            announced, self._announced = self._announced, {}
+            begins = [
+                self._begins.pop(phase, (self._noted, place)),
+                *self._named(record),
+                *announced.values(),
+            ]
             self._phases[phase] = _Phase(
                 record,
                 None if before is None else before.commit,
                 min(begins, key=lambda begin: begin[0])[1],
                 place,
+                frozenset(announced),
             )
             self.newest = phase
 

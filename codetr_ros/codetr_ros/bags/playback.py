@@ -191,6 +191,7 @@ class Playback:
 
     missing = unlabelled = uncommitted = unpermitted = None  # it takes no phases in
     unannounced = False
+    left_out: frozenset[str] = frozenset()
     due = permitted = None
 
     def __init__(

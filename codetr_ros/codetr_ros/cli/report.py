@@ -185,11 +185,12 @@ def from_bag(
         else r
         for name, r in found.reports.items()
     }
+    needed = _needed(settings, found.reports)
     built = summary.build(
         named,
         bag,
-        before.interrupted if before else _interrupted(found.reports),
-        before.failure if before else _failure(found.reports),
+        before.interrupted if before else _interrupted(needed),
+        before.failure if before else _failure(needed),
     )
     built = built.model_copy(update=_kept(built, before))
     results.write(folder, summary, built, draw)
@@ -232,17 +233,23 @@ def _kept(built: RunSummary, before: RunSummary | None) -> dict[str, object]:
     return {'processes': processes | taken, **kept}
 
 
-def _failure(reports: Mapping[str, NodeReport]) -> str | None:
+def _needed(settings: Settings, reports: Mapping[str, NodeReport]) -> list[NodeReport]:
+    """The reports of nodes that a run cannot do without: simulators in `joiners` come and go."""
+    return [
+        report
+        for report in reports.values()
+        if not TABLE[report.role].dispensable
+        and not (report.role == 'sim' and report.name in settings.joiners)
+    ]
+
+
+def _failure(needed: Sequence[NodeReport]) -> str | None:
     """Why the nodes gave up, the first one first: the others followed it. None if none did."""
-    needed = [report for report in reports.values() if not TABLE[report.role].dispensable]
     gone = sorted(needed, key=lambda one: math.inf if one.wall_s is None else one.wall_s)
     why = [f'{report.name}: {report.error}' for report in gone if report.error]
     return '; '.join(why) or None
 
 
-def _interrupted(reports: Mapping[str, NodeReport]) -> bool:
+def _interrupted(needed: Sequence[NodeReport]) -> bool:
     """Whether nodes were asked to end before the run was over."""
-    return any(
-        report.finished is False and not report.error and not TABLE[report.role].dispensable
-        for report in reports.values()
-    )
+    return any(report.finished is False and not report.error for report in needed)

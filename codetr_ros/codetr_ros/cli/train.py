@@ -25,6 +25,7 @@ from codetr_ros.cli import (
 )
 from codetr_ros.cli.audience import Audience
 from codetr_ros.cli.flags import parse
+from codetr_ros.cli.joiners import how_to_join
 from codetr_ros.cli.outcome import Outcome
 from codetr_ros.cli.terminal import console
 from codetr_ros.cli.train_flags import FLAGS, wrong
@@ -166,6 +167,11 @@ def _does_not_fit(settings: Settings, extra: Mapping[str, Any], in_process: bool
             f'--camera with --scorer {settings.scorer}: no page to score is served; add '
             '--scorer person'
         )
+    if settings.joiners and in_process:
+        return (
+            f'--joiners {" ".join(settings.joiners)} with --in-process: nobody joins a run without '
+            'nodes; leave out one of them'
+        )
     if extra['score_service'] and in_process:
         return '--score-service with --in-process: services need nodes; leave out one of them'
     return None
@@ -244,6 +250,8 @@ def train(
         progress.log(reason)
     if namespace is not None:
         progress.log(f'namespace: {namespace}')
+        for line in how_to_join(settings, namespace):
+            progress.log(line)
     events = None
     if shown.tensorboard:
         events = Events(folder / run_folder.TENSORBOARD, settings, progress.log)

@@ -98,6 +98,11 @@ class Consumer(Part, ABC):
         """Whether what one of the sources simulates is not known yet."""
         return not self._intake.tasks.known
 
+    @property
+    def left_out(self) -> frozenset[str]:
+        """The sources that the newest commit that was taken in names as left out."""
+        return self._intake.absent.now
+
     def catch_up(self, newest: int) -> None:
         """Note that phases up to `newest` are committed, whether their commits have come or not:
         those that have not been taken in are then missing.

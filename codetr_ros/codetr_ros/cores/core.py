@@ -53,6 +53,10 @@ class Core(Protocol[Given_co]):
         """A phase whose labels are awaited; None if there is none."""
 
     @property
+    def left_out(self) -> frozenset[str]:
+        """The sources that are no part of the run now, as far as that is known here."""
+
+    @property
     def duplicated(self) -> 'Counter[str]':
         """Counts of records that arrived again and were dropped, by topic."""
 
@@ -131,6 +135,11 @@ class Part:
     def unlabelled(self) -> int | None:
         """A phase whose labels are awaited; None if there is none."""
         return None
+
+    @property
+    def left_out(self) -> frozenset[str]:
+        """The sources that are no part of the run now, as far as that is known here."""
+        return frozenset()
 
     def waiting_for(self) -> str:
         """What the next slice waits for, for people."""

@@ -68,15 +68,19 @@ class Absent:
 
     Args:
         settings: of the run.
+
+    Attributes:
+        now: the sources that the newest commit names as left out.
     """
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
+        self.now = settings.joining_sources
         self._dropped: dict[int, frozenset[str]] = {}
 
     def follow(self, commit: Commit) -> None:
         """Take note of who was left out of a phase, in the order of phases."""
-        self._dropped[commit.phase] = frozenset(commit.dropped)
+        self.now = self._dropped[commit.phase] = frozenset(commit.dropped)
         self._dropped.pop(commit.phase - self._settings.lag, None)
 
     def of(self, phase: int) -> frozenset[str] | None:

@@ -181,8 +181,10 @@ class Recorder(Part):
             )
 
     @property
-    def absent(self) -> frozenset[str]:
-        """The sources that were left out and have not announced themselves again."""
+    def left_out(self) -> frozenset[str]:
+        """The sources that were left out or have not joined yet, and that have not announced
+        themselves since.
+        """
         return frozenset(self._absent)
 
     def leave_out(self, sources: Collection[str]) -> list[str]:

@@ -136,6 +136,23 @@ class Simulator(Part):
         for source in self._sources:
             source.resume()
 
+    def wait_for_place(self, phase: int) -> None:
+        """Begin in a run that goes on without this simulator, and wait until it is let in. Call it
+        before `work`, if at all.
+
+        Args:
+            phase: the first that is not committed.
+        """
+        self._phase = self._first = phase
+        self._resumed = True
+        self.finished = phase >= self._settings.phases
+        self._note_left_out(0)
+
+    @property
+    def is_new(self) -> bool:
+        """Whether nothing of it has ever been recorded or voided."""
+        return not any(source.has_begun for source in self._sources)
+
     def receive(self, record: Record) -> None:
         """Keep a policy until its phase's turn.
 
@@ -230,8 +247,9 @@ class Simulator(Part):
 
     def _note_left_out(self, phases: int) -> None:
         if not self._left_out:
-            _log.warning(
-                '%s is left out of the run: it begins again where what was recorded of it ends, '
+            _log.log(
+                logging.WARNING if self._ran else logging.INFO,
+                '%s takes no part in the run now: it goes on where what was recorded of it ends, '
                 'as soon as it is permitted to', self._name,
             )  # fmt: skip
         self._left_out = True

@@ -218,7 +218,7 @@ class Keeping:
             return False
         if not self._bag.repeats.knows(record):
             return False
-        if isinstance(record, TaskSpec) and record.source in self._core.absent:
+        if isinstance(record, TaskSpec) and record.source in self._core.left_out:
             self._core.receive(record)  # it is there again
             return True
         permits = isinstance(record, Policy) and not self._by.settings.free
@@ -295,20 +295,23 @@ class Keeping:
         """Go on without simulators that are silent, if there are others."""
         silent = self._silence.sources(self._by.clock())
         for source in self._core.leave_out(silent):
+            seconds, after = silent[source], self._silence.after
+            why = (
+                f'nothing has come from it for {seconds:.0f} s (parameter leave_out_after: '
+                f'{after:g} s)'
+                if seconds > after
+                else 'it has ended'
+            )
             self._log.warning(
-                f'{source} is left out of phase {self._core.phase}: nothing has come from it for '
-                f'{silent[source]:.0f} s (parameter leave_out_after: {self._silence.after:g} s). '
-                'Its steps of the phase are dropped; it joins again with a later one'
+                f'{source} is left out of phase {self._core.phase}: {why}. Its steps of the '
+                'phase are dropped; it joins again with a later one'
             )
             self._by.begin_counting_anew()  # what it has not sent yet is dropped
 
     def _gone(self, peer: Peer, now: float) -> bool:
         """Whether a node is silent and all that it simulates is left out: nobody waits for it."""
-        if peer.presence.role != 'sim':
-            return False
         self._silence.sources(now)
-        sources = self._by.settings.sources_of(peer.presence.node.rpartition('/')[2])
-        out = set(sources) <= self._core.absent
+        out = peer.left_out(self._by.settings, self._core.left_out)
         return out and (peer.failed or self._silence.silent(peer, now))
 
     def _ask_again(self, lost: Collection[str]) -> None:

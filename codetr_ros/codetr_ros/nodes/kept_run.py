@@ -16,7 +16,15 @@ from codetr_ros.bags.topics import BagTopic
 from codetr_ros.bags.writer import CHUNK_BYTES, McapWriter, Written
 from codetr_ros.nodes.last_phases import LastPhases
 from codetr_ros.nodes.repeats import Repeats
-from codetr_ros.records import TOPICS, Commit, EpisodeResult, Record, RecordError, RunSpec
+from codetr_ros.records import (
+    TOPICS,
+    Commit,
+    EpisodeResult,
+    Record,
+    RecordError,
+    RunSpec,
+    TaskSpec,
+)
 from codetr_ros.records.fields import RECORD_TYPES, type_name
 from codetr_ros.records.identity import phase_of
 from codetr_ros.runs.reports import BagReport
@@ -224,8 +232,12 @@ class KeptRun:
 def _of(
     messages: Iterable[tuple[type, bytes]], kinds: Collection[str]
 ) -> Iterator[tuple[type, bytes]]:
-    """Messages of these types; all where none is named."""
-    return ((kind, data) for kind, data in messages if not kinds or type_name(kind) in kinds)
+    """Messages of these types; all but announcements where none is named."""
+    return (
+        (kind, data)
+        for kind, data in messages
+        if (type_name(kind) in kinds if kinds else kind is not TaskSpec)
+    )
 
 
 def _run_in(folder: Path) -> str | None:

@@ -1,6 +1,13 @@
 """The last phases of a run, as the recorder keeps them for a node that lacks some of them."""
 
-from codetr_ros.records import Commit, CompositeReward, Preference, Record, Transitions
+from codetr_ros.records import (
+    Commit,
+    CompositeReward,
+    Preference,
+    Record,
+    TaskSpec,
+    Transitions,
+)
 from codetr_ros.records.chain import named, publisher
 
 
@@ -26,6 +33,9 @@ class LastPhases:
         if isinstance(record, (Transitions, CompositeReward, Preference)):
             key = (*publisher(record), record.sequence)
             self._open.setdefault(key, (type(record), raw))
+        elif isinstance(record, TaskSpec):
+            # no commit names it: it belongs to the phase that is committed next
+            self._open.setdefault((TaskSpec, record.source, -1), (TaskSpec, raw))
 
     def commit(self, commit: Commit, raw: bytes) -> None:
         """File the records that a commit names under its phase; forget the oldest phase."""

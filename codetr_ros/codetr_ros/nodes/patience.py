@@ -2,7 +2,7 @@
 waits.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -47,6 +47,7 @@ class Patience:
         log: logs warnings.
         outside: whether a node of the run may wait for what no other node brings: a robot for a
             person, for example. Then nobody can know that everybody waits in vain.
+        left_out: whether nobody waits for a node, because it was left out of the run.
     """
 
     def __init__(
@@ -57,6 +58,7 @@ class Patience:
         limit: Limit,
         log: Warns,
         outside: bool = False,
+        left_out: Callable[[Peer], bool] = lambda peer: False,
     ) -> None:
         self._who = who
         self._peers = peers
@@ -66,6 +68,7 @@ class Patience:
         self._again = limit.again
         self._log = log
         self._outside = outside
+        self._left_out = left_out
         self._named: dict[str, float] = {}
 
     def check(self, now: float, waiting: float, doing: str, lost: Mapping[str, int]) -> None:
@@ -132,7 +135,7 @@ class Patience:
     def _check_silent(self, now: float, waiting: float, doing: str) -> None:
         for peer in self._peers.awaited(self._topics):
             silent = now - peer.received_at
-            if peer.presence.finished or silent < 2 * NAME_EVERY:
+            if peer.presence.finished or silent < 2 * NAME_EVERY or self._left_out(peer):
                 continue
             who = peer.who
             if self._deadline and silent > self._deadline and waiting > self._deadline:
@@ -147,8 +150,9 @@ class Patience:
 
     def _check_finished(self, now: float, waiting: float, doing: str) -> None:
         for role in TABLE[self._peers.role].relies_on:
-            gone = [peer for peer in self._peers.alive(role) if peer.presence.finished]
-            all_gone = gone and len(gone) == len(self._peers.alive(role))
+            there = [peer for peer in self._peers.alive(role) if not self._left_out(peer)]
+            gone = [peer for peer in there if peer.presence.finished]
+            all_gone = gone and len(gone) == len(there)
             patience = GRACE if all_gone else max(GRACE, self._deadline)
             settled = all(now - peer.received_at > GRACE for peer in gone)
             if gone and waiting > patience and settled:

@@ -6,7 +6,7 @@ subscriptions cannot distinguish a recorder from `ros2 topic echo`. From then on
 """
 
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from codetr_ros.config import Settings
@@ -46,9 +46,25 @@ class Peer:
         return presence.doing.removeprefix(GAVE_UP)
 
     @property
+    def name(self) -> str:
+        """Its name within the run."""
+        return self.presence.node.rpartition('/')[2]
+
+    @property
     def dispensable(self) -> bool:
         """Whether the run goes on without it, and ends well."""
         return TABLE[self.presence.role].dispensable
+
+    def left_out(self, settings: Settings, sources: Collection[str]) -> bool:
+        """Whether it simulates only sources that are left out of the run: nobody waits for it.
+
+        Args:
+            settings: of the run.
+            sources: those that are left out.
+        """
+        if self.presence.role != 'sim':
+            return False
+        return set(settings.sources_of(self.name)) <= set(sources)
 
     @property
     def failed(self) -> bool:
@@ -63,10 +79,19 @@ class Peer:
 
 @dataclass
 class Peers:
-    """The other nodes of the run, by instance: a restarted process is another one."""
+    """The other nodes of the run, by instance: a restarted process is another one.
+
+    Attributes:
+        role: that of this node.
+        by_instance: the others.
+        joiners: names of simulators that need not be there: they come and go.
+        joins: whether this node is one of them.
+    """
 
     role: str
     by_instance: dict[str, Peer] = field(default_factory=dict)
+    joiners: Collection[str] = ()
+    joins: bool = False
 
     def note(self, presence: Presence, now: float) -> str | None:
         """Note a peer's presence; returns what is new about it, for the log."""
@@ -83,6 +108,16 @@ class Peers:
             now_known = self.by_instance[presence.instance_id]
             return f'{who} has {"given up" if now_known.failed else "ended"}'
         return None
+
+    def know(self, settings: Settings | None, name: str) -> None:
+        """Take note of the simulators that come and go.
+
+        Args:
+            settings: of the run; None: there are none.
+            name: of this node within the run.
+        """
+        self.joiners = settings.joiners if settings else ()
+        self.joins = self.role == 'sim' and name in self.joiners
 
     def newest(self) -> list[Peer]:
         """The newest instance of each node. A killed instance publishes no last presence, and
@@ -107,9 +142,9 @@ class Peers:
         """
         missing = []
         for role, count in settings.roles.items():
-            there = self.alive(role)
+            there = [peer for peer in self.alive(role) if not self._comes_and_goes(peer)]
             ready = [p for p in there if p.presence.settings_hash == settings_hash]
-            have = len(ready) + (role == self.role)
+            have = len(ready) + (role == self.role and not self.joins)
             if have >= count:
                 continue
             of = f' {have + 1} of {count}' if count > 1 else ''
@@ -133,15 +168,15 @@ class Peers:
 
     def failed(self, among: Iterable[Peer] | None = None) -> list[str]:
         """Roles and names of the nodes that have died or else, since a node that dies makes others
-        give up, of those that have given up, in words. Nodes that the run can do without are left
-        out.
+        give up, of those that have given up, in words. Nodes that the run can do without, and
+        simulators that come and go, are left out.
 
         Args:
             among: the nodes that count; None: all.
         """
         died, given_up = [], []
         for peer in self.newest() if among is None else among:
-            if peer.failed and not peer.dispensable:
+            if peer.failed and not peer.dispensable and not self._comes_and_goes(peer):
                 if peer.presence.finished:
                     why = f' ({peer.cause})' if peer.cause else ''
                     given_up.append(f'{peer.who} has given up{why}')
@@ -151,10 +186,13 @@ class Peers:
 
     def cause(self) -> str:
         """The first cause for which others have given up, as far as it is known; else empty.
-        Nodes that the run can do without are left out.
+        Nodes that the run can do without, and simulators that come and go, are left out.
         """
-        causes = (peer.cause for peer in self.newest() if not peer.dispensable)
-        return next(filter(None, causes), '')
+        needed = (p for p in self.newest() if not p.dispensable and not self._comes_and_goes(p))
+        return next(filter(None, (peer.cause for peer in needed)), '')
+
+    def _comes_and_goes(self, peer: Peer) -> bool:
+        return peer.presence.role == 'sim' and peer.name in self.joiners
 
     def abandoned(self, now: float, grace: float, deadline: float) -> list[Peer]:
         """Nodes that the run can do without, and that have given up or are gone.

@@ -26,11 +26,15 @@ from codetr_ros.records import (
     EpisodeResult,
     Policy,
     Record,
+    TaskSpec,
     Transitions,
     TrueRewards,
 )
 from codetr_ros.records.dropped import undropped
 from codetr_ros.records.fields import type_name
+
+_SIMULATED = (Transitions, TrueRewards, CompositeReward)
+"""What is recorded of a simulator in a phase."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +162,8 @@ def take_place(node: Returning) -> Steps:
     node.core.begin_anew()
     yield from _restore_episodes(node, newest)
     node.core.resume(max(newest + 1, node.core.due))
-    node.log.info(f'joins the run again with phase {node.core.due}')
+    again = '' if node.core.is_new else ' again'
+    node.log.info(f'joins the run{again} with phase {node.core.due}')
 
 
 def _has_begun(peers: Peers) -> bool:
@@ -191,27 +196,40 @@ def _log_checkpoint(node: Returning, phase: int) -> None:
 
 
 def _simulator(node: Returning, newest: int) -> Steps:
+    _, (commit,) = yield Question(newest, (Commit,))
+    assert isinstance(commit, Commit)
+    own = node.settings.sources_of(node.name)
+    if set(own) <= set(commit.dropped) - set(commit.sources):
+        node.core.wait_for_place(newest + 1)
+        return
     yield from _restore_episodes(node, newest)
     node.core.resume(newest + 1)
 
 
 def _restore_episodes(node: Returning, newest: int) -> Steps:
     phases: list[list[Record]] = []
-    # sources whose episode under way begins in an earlier phase
-    open_ = set(node.settings.sources_of(node.name))
+    own = set(node.settings.sources_of(node.name))
+    open_ = set(own)  # sources whose episode under way begins in an earlier phase
     for phase in range(newest, -1, -1):
-        _, given = yield Question(phase, (Transitions, TrueRewards, CompositeReward, Commit))
-        records = list(undropped(given))
+        _, given = yield Question(phase, (TaskSpec, *_SIMULATED, Commit))
+        records = [each for each in undropped(given) if _concerns(each, own)]
         phases.append(records)
         open_ -= {
             record.source
             for record in records
-            if isinstance(record, Transitions) and record.first_step == 0
+            # nothing was recorded of a source before it announced itself
+            if isinstance(record, TaskSpec)
+            or (isinstance(record, Transitions) and record.first_step == 0)
         }
         if not open_:
             break
     for record in chain.from_iterable(reversed(phases)):
-        node.core.restore(record)
+        if not isinstance(record, TaskSpec):
+            node.core.restore(record)
+
+
+def _concerns(record: Record, sources: Collection[str]) -> bool:
+    return isinstance(record, Commit) or getattr(record, 'source', None) in sources
 
 
 def _robot_goes_on(node: Returning) -> Steps:

@@ -43,7 +43,7 @@ class Silence:
             source: now - peer.received_at
             for peer in self._peers.alive('sim')
             if peer.presence.finished or self.silent(peer, now)
-            for source in settings.sources_of(peer.presence.node.rpartition('/')[2])
+            for source in settings.sources_of(peer.name)
         }
 
     def silent(self, peer: Peer, now: float) -> bool:

@@ -10,7 +10,7 @@ from codetr_ros.bags.definitions import decode_sent
 from codetr_ros.config import Settings
 from codetr_ros.cores.core import Core, Silent
 from codetr_ros.nodes.admission import Admission, Unknown
-from codetr_ros.nodes.peers import Ledger
+from codetr_ros.nodes.peers import Ledger, Peer
 from codetr_ros.records import (
     TOPICS,
     Commit,
@@ -311,6 +311,10 @@ class Traffic:
         wanted = [TOPICS[k] for k in self.core.subscribes] if topics is None else topics
         lost = self.ledger.lost(self.received + self.recovered, self._clock())
         return {topic: n for topic, n in lost.items() if topic in wanted}
+
+    def left_out(self, peer: Peer) -> bool:
+        """Whether nobody waits for a node: all that it simulates is left out of the run."""
+        return self.settings is not None and peer.left_out(self.settings, self.core.left_out)
 
     def counters(self) -> dict[str, dict[str, int]]:
         """All counts, by their names on /diagnostics."""

@@ -136,7 +136,8 @@ class Membership:
         """What watches over this node while it waits for records on these topics."""
         settings = self.traffic.settings
         outside = settings is not None and settings.on_robot
-        return Patience(self.link.full_name, self.peers, topics, self.limit, self.log, outside)
+        who, left_out = self.link.full_name, self.traffic.left_out
+        return Patience(who, self.peers, topics, self.limit, self.log, outside, left_out)
 
     def introduce(self) -> None:
         """Declare the node's own parameters, and subscribe to presences and runs.
@@ -184,6 +185,7 @@ class Membership:
         """
         self.traffic.core, self.traffic.settings = core, settings
         self.traffic.admission.settings = settings
+        self.peers.know(settings, self.link.name)
         self._serves = True
         if self.run is not None:
             self.traffic.run_id = self.run.run_id

@@ -87,12 +87,14 @@ class PhaseService:
         return response
 
     def _note(self, requester: str, phase: int) -> None:
-        """Log who lacks something, once where a node asks for one phase after the other."""
+        """Log who lacks something, once where a node asks for one phase after the other: up to
+        where the run stands, or back to where its episode began.
+        """
         before = self._sent.get(requester)
         if len(self._sent) > MOST_REQUESTERS:
             self._sent.clear()
         self._sent[requester] = phase
-        if before is None or phase not in (before, before + 1):
+        if before is None or abs(phase - before) > 1:
             self._log.warning(
                 f'{shown(requester)} lacks something of phase {phase}: sending it again'
             )

@@ -163,6 +163,7 @@ class Process:
         self.lasting: defaultdict[type, deque[Packet]] = defaultdict(deque)
         self.doing = 'starting'
         self.peers = Peers(self.role)
+        self.peers.know(place.settings, self.name)
         self.limit = Limit(place.deadline)
         self.log = _Log(self.world, self.name)
         self.traffic = Traffic(self.log, self.now)
@@ -178,6 +179,7 @@ class Process:
             [TOPICS[kind] for kind in core.subscribes],
             self.limit,
             self.log,
+            left_out=self.traffic.left_out,
         )
         take, phases = self.traffic.take_again, Commit in core.subscribes
         self._fetcher = Fetcher(self.make_asker, self.peers, take, self.log, phases, self.now)

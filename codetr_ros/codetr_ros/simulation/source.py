@@ -87,6 +87,11 @@ class Source:
         """
         self._recorded.take(record)
 
+    @property
+    def has_begun(self) -> bool:
+        """Whether it has published any steps, or numbers of it were voided."""
+        return self._sequence > 0
+
     def skip(self, sequence: int, scores: int | None) -> None:
         """Go on behind numbers that are voided, because this source was left out of a phase.
 
