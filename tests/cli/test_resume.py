@@ -13,6 +13,7 @@ import pytest
 from codetr_ros.bags.verify import verify
 from codetr_ros.cli import train
 from codetr_ros.processes import launcher
+from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import origin
 from codetr_ros.runs.origin import held
 from helpers.builders import tiny
@@ -173,3 +174,38 @@ def test_a_run_that_is_under_way_is_left_alone(run, capsys, monkeypatch):
     with held(run):
         assert train.main(['--resume', str(run), '--steps', '600', '--no-film']) == 2
     assert 'is under way in another process' in capsys.readouterr().err
+
+
+def test_a_run_that_was_killed_before_it_had_begun_is_begun_again(tmp_path, capsys):
+    settings = tiny(method='uniform', steps=400, warmup_steps=200, threads=1, evaluate_every=0)
+    folder = run_folder.create(tmp_path / 'run')
+    origin.write(folder, origin.origin(settings, 'before', '/run_before', True, True, None))
+    (folder / '.config.yaml.7.partial').touch()
+    assert train.main(['--resume', str(folder)]) == 2
+    assert f'nothing is lost. Start it again, with --out {folder}' in ' '.join(
+        capsys.readouterr().err.split()
+    )
+    assert done(settings, folder)['steps'] == 400
+    assert not list(folder.glob('.*'))
+    assert origin.read(folder).run_id != 'before'
+
+
+def test_a_run_that_was_killed_when_it_had_just_begun_goes_on(tmp_path, capsys):
+    settings = tiny(method='uniform', steps=400, warmup_steps=200, threads=1, evaluate_every=0)
+    folder = run_folder.create(tmp_path / 'run')
+    origin.write(folder, origin.origin(settings, 'run', '/run_run', True, True, None))
+    run_folder.write_settings(folder, settings)
+    again = ['--config', str(folder / 'config.yaml'), '--out', str(folder), '--in-process']
+    assert train.main(again) == 2
+    assert f'codetr train --resume {folder}' in ' '.join(capsys.readouterr().err.split())
+    flags = ('--resume', str(folder), '--no-film')
+    summary, _ = finish(codetr('train', *flags, environment=ENVIRONMENT), folder)
+    assert summary['steps'] == 400
+
+
+def test_a_bag_without_the_settings_of_its_run_is_refused_with_the_remedy(tmp_path, capsys):
+    (tmp_path / 'bag').mkdir()
+    assert train.main(['--resume', str(tmp_path)]) == 2
+    assert 'has a bag and no config.yaml: restore that from a copy' in ' '.join(
+        capsys.readouterr().err.split()
+    )

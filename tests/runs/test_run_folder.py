@@ -36,6 +36,36 @@ def test_a_folder_that_holds_something_is_refused_and_left_alone(tmp_path: Path)
     assert len(list(tmp_path.iterdir())) == 4
 
 
+LEFT = ('run.json', '.run.json.7.partial', '.config.yaml.7.partial')
+"""Files of a start that was killed."""
+
+
+def test_a_folder_of_a_run_that_was_killed_before_it_had_begun_is_taken_again(tmp_path):
+    folder = tmp_path / 'run'
+    for files in ((), *((name,) for name in LEFT), LEFT):
+        run_folder.create(folder)
+        for name in files:
+            (folder / name).write_text('{')
+        assert run_folder.has_only_begun(folder)
+        run_folder.begin_anew(run_folder.create(folder))
+        assert sorted(p.name for p in folder.iterdir()) == ['checkpoints', 'logs', 'nodes']
+
+
+@pytest.mark.parametrize('name', ['config.yaml', 'bag/a', 'logs/sim.log', 'checkpoints/learner-1'])
+def test_a_folder_that_holds_anything_of_a_run_is_not(tmp_path, name):
+    folder = run_folder.create(tmp_path / 'run')
+    for file in ('run.json', name):
+        (folder / file).parent.mkdir(exist_ok=True)
+        (folder / file).touch()
+    assert not run_folder.has_only_begun(folder)
+    for refused in (run_folder.create, run_folder.begin_anew):
+        with pytest.raises(RunFolderError, match='is not empty') as caught:
+            refused(folder)
+        goes_on = f'goes on with `codetr train --resume {folder}`' in str(caught.value)
+        assert goes_on == (name == 'config.yaml')
+    assert (folder / name).is_file()
+
+
 def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(tmp_path: Path) -> None:
     name = tmp_path / 'runs' / 'task-20260101-120000'
 

@@ -51,6 +51,16 @@ def _settings_of(folder: Path) -> Settings:
     Raises:
         RunFolderError: it is no folder of a run, or its settings are refused.
     """
+    if run_folder.has_only_begun(folder):
+        raise RunFolderError(
+            f'the run in {folder} was ended before it had begun: there is no {run_folder.CONFIG} '
+            f'yet, and nothing is lost. Start it again, with --out {folder}'
+        )
+    if not (folder / run_folder.CONFIG).is_file() and (folder / run_folder.BAG).is_dir():
+        raise RunFolderError(
+            f'the run in {folder} has a {run_folder.BAG} and no {run_folder.CONFIG}: restore that '
+            'from a copy, or start the run again in another folder'
+        )
     try:
         return run_folder.read_settings(folder)
     except SettingsError as error:

@@ -169,8 +169,8 @@ def _does_not_fit(settings: Settings, extra: Mapping[str, Any], in_process: bool
         )
     if settings.joiners and in_process:
         return (
-            f'--joiners {" ".join(settings.joiners)} with --in-process: nobody joins a run without '
-            'nodes; leave out one of them'
+            f'--joiners {" ".join(settings.joiners)} with --in-process: nobody joins a run '
+            'without nodes; leave out one of them'
         )
     if extra['score_service'] and in_process:
         return '--score-service with --in-process: services need nodes; leave out one of them'
@@ -225,12 +225,13 @@ def train(
             notes += resume.begin(folder, begun, settings)
             run_folder.forget_reports(folder)
         else:
-            run_folder.write_settings(folder, settings)
+            run_folder.begin_anew(folder)
             where = namespace or launcher.namespace_of(run_id)
             recorded = bag or not in_process
             origin.write(
                 folder, origin.origin(settings, run_id, where, in_process, recorded, command)
             )
+            run_folder.write_settings(folder, settings)  # the last: from now on it can go on
     except (OSError, RunFolderError) as error:
         return refuse(str(error))
     recorded_before = True if begun is not None else None

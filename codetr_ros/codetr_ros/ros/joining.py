@@ -178,11 +178,12 @@ def join(
     folder = member.folder
     if announce is not None and folder:
         make_folder(folder)
-        if not (folder / run_folder.CONFIG).exists():
-            run_folder.write_settings(folder, settings)
-        if not (folder / run_folder.ORIGIN).exists():
+        begun = (folder / run_folder.CONFIG).exists()
+        if not (begun and (folder / run_folder.ORIGIN).exists()):
             namespace = link.full_name.rpartition('/')[0] or '/'
             origin.write(folder, origin.origin(settings, run.run_id, namespace, False, True, None))
+        if not begun:
+            run_folder.write_settings(folder, settings)  # the last: from now on it can go on
     checkpoints = folder / run_folder.CHECKPOINTS if folder else None
     core = make_core(run, settings, link.name, checkpoints, **member.core_values)
     member.serve(core, settings)

@@ -31,17 +31,54 @@ POLICY = 'policy.safetensors'
 
 EVERY = (NODES, LOGS, CHECKPOINTS)
 """The folders in it that every run has from its beginning on."""
+_HALF_WRITTEN = re.compile(rf'\.({re.escape(CONFIG)}|{re.escape(ORIGIN)})\.\d+\.partial')
+"""Names of the files of `atomic_write` that a start which was killed may leave."""
 
 
 class RunFolderError(ValueError):
     """A folder that cannot hold a run, or holds none: the message names it and the remedy."""
 
 
-def check(path: Path) -> None:
-    """Check that `create` would accept this folder, without making anything.
+def _left(folder: Path) -> list[Path] | None:
+    """The files that a run has left which was ended before it had begun, if the folder holds
+    nothing else; None if it holds anything that somebody would miss.
+
+    A run begins with `config.yaml`, which is written last.
+    """
+    left = []
+    for entry in folder.iterdir():
+        if entry.name in EVERY and entry.is_dir() and not any(entry.iterdir()):
+            continue
+        if entry.name != ORIGIN and not _HALF_WRITTEN.fullmatch(entry.name):
+            return None
+        left.append(entry)
+    return left
+
+
+def has_only_begun(folder: Path) -> bool:
+    """Whether a run was ended in this folder before it had begun: nothing of it can be lost."""
+    return folder.is_dir() and any(folder.iterdir()) and _left(folder) is not None
+
+
+def begin_anew(folder: Path) -> None:
+    """Remove the files of a run that was ended before it had begun. Call it while the folder is
+    held: see `origin.held`.
 
     Raises:
-        RunFolderError: it exists and is not empty, is not a folder, or cannot be written.
+        RunFolderError: a run has begun here meanwhile.
+        OSError: one cannot be removed.
+    """
+    check(folder)
+    for path in _left(folder) or ():
+        path.unlink()
+
+
+def check(path: Path) -> None:
+    """Check that `create` would accept this folder, without making anything: a new one, an empty
+    one, or one in which a run was ended before it had begun.
+
+    Raises:
+        RunFolderError: it holds anything else, is not a folder, or cannot be written.
     """
     if path.exists():
         if not path.is_dir():
@@ -50,11 +87,14 @@ def check(path: Path) -> None:
             check_writable(path)
         except FileError as error:
             raise RunFolderError(f'output folder {error} with --out') from None
-        if names := sorted(entry.name for entry in path.iterdir()):
+        if _left(path) is None:
+            names = sorted(entry.name for entry in path.iterdir())
             shown = ', '.join(names[:3]) + (', ...' if len(names) > 3 else '')
+            goes_on = CONFIG in names and ORIGIN in names
             raise RunFolderError(
                 f'output folder {path} exists and is not empty ({shown}): choose another with '
                 '--out, or remove it'
+                + (f'. The run in it goes on with `codetr train --resume {path}`' * goes_on)
             )
         return
     try:
@@ -70,13 +110,14 @@ def create(path: Path) -> Path:
         The absolute path.
 
     Raises:
-        RunFolderError: it exists and is not empty, or it cannot be written.
+        RunFolderError: it holds something (see `check`), or it cannot be written.
     """
     check(path)
     folder = path.absolute()
+    again = has_only_begun(folder)
     try:
         for name in EVERY:
-            (folder / name).mkdir(parents=True)
+            (folder / name).mkdir(parents=True, exist_ok=again)
     except FileExistsError as error:  # since it was checked
         raise RunFolderError(
             f'output folder {path} was made by another run just now: choose another with --out'
