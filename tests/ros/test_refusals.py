@@ -1,6 +1,7 @@
 """What a node refuses to begin, or to go on with: it says why and ends with exit code 1."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -196,7 +197,7 @@ from codetr_ros.processes import middleware
 from codetr_ros.ros.node import Node, run_node
 
 def show(node):
-    print(*(os.environ[name] for name in middleware.DEFAULTS))
+    print('shown', *(os.environ[name] for name in middleware.DEFAULTS))
     node.member.close()
     return 0
 
@@ -211,7 +212,8 @@ def test_a_node_started_by_hand_looks_at_this_host_only_unless_the_user_says_oth
     def shown(environ):
         command = [sys.executable, '-c', SHOW]
         done = subprocess.run(command, env=environ, capture_output=True, text=True, check=True)
-        return done.stdout.split()
+        (line,) = re.findall(r'^shown (.*)$', done.stdout, re.MULTILINE)
+        return line.split()
 
     assert shown(bare) == ['LOCALHOST', 'SYNCHRONOUS']
     asked = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}
