@@ -1,11 +1,13 @@
 """Are the inferred step rewards the true ones? Reward recovery on held-out episodes.
 
     .venv/bin/python benchmarks/reward_recovery.py --out benchmarks/results/reward_recovery.csv
+    .venv/bin/python benchmarks/reward_recovery.py --task Reacher-v5 --steps 8000 --delay 50 ...
 
-The data is the replay of a true-reward run of 20 000 steps on HalfCheetah (small networks), so
-that it ranges from random to running. Four fifths of its episodes train each model, only with
-composite rewards of 25 steps; every fifth episode is held out. For each composite reward and each
-variant (CoDeTr, changed in one setting, or another method) it gives
+The data is the replay of a true-reward run (small networks), by default of 20 000 steps on
+HalfCheetah, so that it ranges from random to running. Four fifths of its episodes train each
+model, only with composite rewards of segments (25 steps by default); every fifth episode is held
+out. For each composite reward and each variant (CoDeTr alone, changed in one setting, or another
+method) it gives
 
     composite_r2       R^2 of the predicted composite reward; nan for methods that predict none
     pearson, spearman  correlation of inferred and true step rewards
@@ -42,10 +44,9 @@ from codetr_ros.runs.recovery_metrics import r_squared, step_recovery
 from codetr_ros.seeding import generator, seed_torch
 from codetr_ros.simulation.composite import composite
 
-DELAY = 25
 COMPOSITES = ('sum', 'sum_square', 'square_sum', 'max')
 VARIANTS: dict[str, dict[str, object]] = {
-    'as shipped': {},
+    'CoDeTr alone': {},  # `as shipped` in tables that were made when `quick` had it so
     'label rhat': {'codetr.label': 'rhat'},
     'weights one': {'codetr.weights': 'one'},
     'head scale 1/sqrt(d)': {'codetr.head_scale': 'inverse_sqrt'},
@@ -288,8 +289,11 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument('--out', type=Path, default=Path('benchmarks/results/reward_recovery.csv'))
+    parser.add_argument('--task', default='HalfCheetah-v5')
+    parser.add_argument('--steps', type=int, default=20_000, help='of the run that is recorded')
+    parser.add_argument('--delay', type=int, default=25, help='steps of a segment')
     parser.add_argument(
-        '--cache', type=Path, default=Path('.venv/cache/reward_recovery_replay.npz')
+        '--cache', type=Path, help='the recording; default: one for each task, in .venv/cache'
     )
     parser.add_argument('--composites', nargs='+', default=list(COMPOSITES), choices=COMPOSITES)
     parser.add_argument('--variants', nargs='+', default=list(VARIANTS), choices=list(VARIANTS))
@@ -298,7 +302,11 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     commit = machine.commit()
-    data = replay(arguments.cache)
+    task, cache = arguments.task, arguments.cache
+    if cache is None:
+        of = '' if task == 'HalfCheetah-v5' else f'_{task}_{arguments.steps}'
+        cache = Path(f'.venv/cache/reward_recovery_replay{of}.npz')
+    data = replay(cache, arguments.steps, task)
     rows = Rows(arguments.out, COLUMNS, keys=4)
     for steps in arguments.gradient_steps:
         for seed in arguments.seeds:
@@ -308,9 +316,10 @@ def main() -> None:
                     if key in rows:
                         continue
                     began = time.perf_counter()
-                    changes = {'composite': name, 'delay': DELAY, 'seed': seed} | VARIANTS[variant]
+                    scored = {'composite': name, 'delay': arguments.delay, 'seed': seed}
+                    changes = {'task': task, 'codetr.base': 'none', **VARIANTS[variant]}
                     first = variant.endswith('state first')
-                    row = measure(data, load('quick').changed(changes), steps, first)
+                    row = measure(data, load('quick').changed(changes | scored), steps, first)
                     numbers = [f'{value:.3f}' for value in row.values()]
                     seconds = time.perf_counter() - began
                     rows.append([*key, *numbers, f'{seconds:.1f}', commit])
