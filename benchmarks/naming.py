@@ -26,7 +26,7 @@ from rows import Rows
 
 import machine
 import reward_recovery
-from codetr_ros.config import load
+from codetr_ros.config import Settings, load
 from codetr_ros.rewards import registry
 from codetr_ros.rewards.base import segment_steps
 from codetr_ros.rewards.evidence.method import Evidence
@@ -54,18 +54,25 @@ COLUMNS = (
 )
 
 
-def trial(number: int, data: dict[str, dict[str, np.ndarray]]) -> list[object]:
-    """A row of the table."""
+def drawn(number: int, data: dict[str, dict[str, np.ndarray]]) -> tuple[Settings, int]:
+    """The settings of a trial, and how many scores it has; `data` may lack other tasks."""
     rng = generator(0, 'naming', number)
     task = str(rng.choice(TASKS))
     kind = str(rng.choice(KINDS))
-    steps = data[task]
-    beta = float(np.exp(rng.uniform(0, math.log(6)))) / float(steps['rewards'].std())
+    beta = float(np.exp(rng.uniform(0, math.log(6)))) / float(data[task]['rewards'].std())
     delay, scores = int(rng.choice(DELAYS)), int(rng.choice(NUMBERS))
     changes = {'composite': kind, 'beta': beta, 'delay': delay, 'seed': number}
     settings = load('quick').changed(
         {**changes, 'method': 'evidence', 'evidence.link': 'choose', 'task': task}
     )
+    return settings, scores
+
+
+def trial(number: int, data: dict[str, dict[str, np.ndarray]]) -> list[object]:
+    """A row of the table."""
+    settings, scores = drawn(number, data)
+    task, kind, beta, delay = settings.task, settings.composite, settings.beta, settings.delay
+    steps = data[task]
     train, held_out = reward_recovery.memories(steps, settings, None, scores)
     began = time.perf_counter()
     made = registry.make(settings, train.observation_size, train.action_size)

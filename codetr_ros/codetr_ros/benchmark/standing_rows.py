@@ -7,7 +7,6 @@ from codetr_ros.benchmark.standings import (
     REACHED,
     REFERENCES,
     Difference,
-    Measure,
     Middle,
     Place,
     Standing,
@@ -15,7 +14,6 @@ from codetr_ros.benchmark.standings import (
 from codetr_ros.benchmark.statistics import CONFIDENCE
 from codetr_ros.config import delay_in_words
 from codetr_ros.runs.document import Block, Bold, Heading, Items, Paragraph, Table
-from codetr_ros.runs.numbers import returns as returns_of
 
 NONE = '–'
 """Shown where there is no value."""
@@ -69,11 +67,12 @@ def title(place: Place) -> str:
 
 def lines(rows: Sequence[Standing]) -> list[list[str | Bold]]:
     """The rows of a table with `HEAD`, of one place."""
+    digits = _decimals(rows)
     return [
         [
             row.method,
             str(row.seeds) if row.seeds == row.planned else f'{row.seeds} of {row.planned}',
-            _middle(row.returns),
+            _middle(row.returns, digits),
             NONE if row.share is None else f'{row.share:.2f}',
             _middle(row.scores, 4),
             NONE if row.within is None else f'{row.within:.2f}',
@@ -92,20 +91,19 @@ def tests(rows: Sequence[Standing]) -> list[Block]:
         if tested:
             head = [f'less `{reference}`', 'pairs', 'return', 'p', 'by Holm']
             head += ['score', 'p', 'by Holm']
-            made.append(Table(head, [_test(row, reference) for row in tested]))
+            made.append(Table(head, [_test(row, reference, _decimals(rows)) for row in tested]))
     return made
 
 
-def _test(row: Standing, reference: str) -> list[str | Bold]:
+def _test(row: Standing, reference: str, digits: int) -> list[str | Bold]:
     by_return = row.against[reference, 'true_return']
     by_score = row.against.get((reference, 'score'))
-    line: list[str | Bold] = [row.method, str(by_return.pairs), *_ps(by_return, 'true_return')]
-    return [*line, *(_ps(by_score, 'score') if by_score else [NONE] * 3)]
+    line: list[str | Bold] = [row.method, str(by_return.pairs), *_ps(by_return, digits)]
+    return [*line, *(_ps(by_score, 4) if by_score else [NONE] * 3)]
 
 
-def _ps(of: Difference, measure: Measure) -> list[str]:
-    mean = returns_of(of.mean)[0] if measure == 'true_return' else f'{of.mean:.4f}'
-    return [mean, p_value(of.p), p_value(of.corrected)]
+def _ps(of: Difference, digits: int) -> list[str]:
+    return [f'{of.mean:.{digits}f}', p_value(of.p), p_value(of.corrected)]
 
 
 def p_value(p: float | None) -> str:
@@ -113,14 +111,15 @@ def p_value(p: float | None) -> str:
     return NONE if p is None else '< 0.001' if p < 0.001 else f'{p:.3f}'
 
 
-def _middle(of: Middle | None, digits: int | None = None) -> str:
+def _decimals(rows: Sequence[Standing]) -> int:
+    """Decimals of the returns of a place."""
+    return 1 if max((abs(row.returns.iqm) for row in rows if row.returns), default=0) >= 10 else 3
+
+
+def _middle(of: Middle | None, digits: int) -> str:
     if of is None:
         return NONE
-    values = (of.iqm, of.low, of.high)
-    iqm, low, high = (
-        returns_of(*values) if digits is None else [f'{value:.{digits}f}' for value in values]
-    )
-    return f'{iqm} ({low} to {high})'
+    return f'{of.iqm:.{digits}f} ({of.low:.{digits}f} to {of.high:.{digits}f})'
 
 
 def _price(row: Standing) -> str:
