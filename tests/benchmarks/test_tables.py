@@ -38,3 +38,23 @@ def test_a_table_is_filled_in_between_its_marks(
     assert filled.endswith('<!-- end -->\nAfter. <!-- table other --> is text.\n')
     assert tables.filled(filled) == filled
     assert 'Not run yet.' in tables.filled(page.replace('some', 'never'))
+
+
+def test_what_the_pages_state_of_methods_on_reacher_is_in_the_results() -> None:
+    """Where this fails after new runs, read docs/reproduction.md and docs/benchmarks.md again."""
+    rows = {row['method']: row for row in tables.rows('reacher_methods')}
+    way = {method: float(row['share']) for method, row in rows.items()}
+    credit = {method: float(row['within']) for method, row in rows.items() if row['within']}
+
+    assert way['evidence'] > 0.9
+    others = way.keys() - {'evidence', 'true'}
+    assert 0.4 < max(way[method] for method in others) < 0.6, 'the best comes half of the way'
+    assert max(credit[m] for m in credit.keys() - {'evidence', 'true'}) < 0.5
+    assert way['ircr'] < way['codetr'] < 0 < way['uniform'] < way['rrd']
+    assert way['codetr'] < way['rbt'] < way['uniform']
+    assert way['none'] < 0
+    for row in tables.rows('reacher_composites'):
+        if row['method'] in {'evidence', 'codetr'}:
+            assert float(row['share']) > 0.9
+        elif row['method'] != 'true':
+            assert float(row['share']) < 0.5
