@@ -8,7 +8,7 @@ from helpers.builders import step_rewards, transitions
 
 def labelled(outbox, phases):
     for phase in phases:
-        outbox.keep(step_rewards(phase=phase))
+        outbox.keep(step_rewards(phase=phase), stamp=phase)
 
 
 def test_labels_are_owed_until_a_reader_asks_for_those_of_a_later_phase():
@@ -35,7 +35,7 @@ def test_a_reader_that_asks_for_labels_to_come_lacks_none_of_those_before():
 
 def test_nobody_waits_for_readers_of_anything_but_labels():
     outbox = Outbox(phase_steps=5, phases=1)
-    outbox.keep(transitions())
+    outbox.keep(transitions(), stamp=1)
     assert not outbox.owes
     labelled(outbox, [1])
     list(outbox.read(1))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from codetr_ros.nodes.errors import NodeError, first_cause
+from codetr_ros.nodes.ledger import Ledger
 from codetr_ros.nodes.patience import Limit, Patience
 from codetr_ros.nodes.peers import GAVE_UP, Peers
 from codetr_ros.nodes.settling import Settling
@@ -120,10 +121,15 @@ def test_a_run_ends_with_or_without_its_evaluator(silent, changes, without):
 def test_an_evaluator_that_works_is_waited_for_and_what_a_dead_one_has_published_is_not():
     settled, doing = evaluator(1.0).check({}, 300.0, 200.0)
     assert not settled and 'waits for the end of evaluate /r/evaluate' in doing
-    dead = evaluator(61.0)
-    assert dead.check({'episodes': 2}, 300.0, 200.0) == (True, 'has finished')
-    with pytest.raises(NodeError, match='1 of episodes'):
-        dead.check({'episodes': 3}, 300.0, 200.0)
+    dead, ledger = evaluator(61.0), Ledger()
+    for role in ('evaluate', 'sim'):
+        counts = {'topics': ('episodes',), 'published': np.array([2], np.uint64)}
+        ledger.note(presence(role, **counts), 1, 139.0)
+    gone = [peer.presence.instance_id for peer in dead.gone(200.0)]
+    missing = ledger.owed(without=gone)
+    assert missing == {'episodes': 2}  # of the simulator
+    with pytest.raises(NodeError, match='2 of episodes'):
+        dead.check(missing, 300.0, 200.0)
 
 
 def test_a_run_whose_evaluator_has_given_up_ends_well():

@@ -72,7 +72,7 @@ def links(ros_domain):
 def test_a_false_answer_is_refused_and_the_true_one_awaited(links):
     asker, sim, liar = links
     outbox, refused, answers, asked = Outbox(5, None), [], [], []
-    outbox.keep(transitions())
+    outbox.keep(transitions(), stamp=1)
     asker.refuse = lambda what, error: refused.append(str(error))
 
     def lie(request, response):

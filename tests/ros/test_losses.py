@@ -108,9 +108,9 @@ def test_what_a_source_has_announced_is_asked_for_if_it_was_lost(play, tmp_path)
     play = play(settings=settings(), roles=('learner', 'sim'))
     outbox = Outbox(phase_steps=5, phases=1)
     serve_outbox(play.links['sim'], 'run', outbox)
-    outbox.keep(task_spec())
+    outbox.keep(task_spec(), stamp=1)
     for record in (transitions(phase=1, sequence=1), transitions(phase=2, sequence=2)):
-        outbox.keep(record)  # of later phases: what was announced is not among the newest
+        outbox.keep(record, stamp=2)  # of later phases: what was announced is not among the newest
     said, report = finishes(play, 'unannounced', tmp_path)
     assert 'what a source has announced had not arrived: it came again' in said
     assert report['lost'] == report['duplicated'] == {}
@@ -129,8 +129,7 @@ def test_permission_for_a_phase_is_asked_for_if_it_was_lost(play, tmp_path):
             policy(steps=np.array([5], np.uint32)),
             policy(phase=1, version=0, steps=np.array([0], np.uint32)),
         ):
-            outbox.keep(record)
-            learner.publish(record)
+            outbox.keep(record, learner.publish(record))
         play.until(lambda: play.presence_of('sim')[-1].finished)
         play.finished = True
         play.until(lambda: node.poll() is not None)
@@ -162,11 +161,9 @@ def test_what_was_lost_of_an_early_phase_is_asked_for_though_later_ones_are_whol
                 run_id='run', source='sim', sequence=phase, phase=phase, episode=0,
                 first_step=steps.first_step, rewards=rewards,
             )  # fmt: skip
-            outbox.keep(steps)
-            outbox.keep(true)
-            sim.publish(steps)
-            if phase:  # those of the first phase do not arrive
-                sim.publish(true)
+            outbox.keep(steps, sim.publish(steps))
+            # those of the first phase do not arrive
+            outbox.keep(true, sim.publish(true) if phase else 1)
             play.until(lambda n=phase: len(play.messages('Commit', 'learner')) > n, node)
         play.claimed = {'true_rewards': 1}
         play.finished = True
@@ -295,7 +292,8 @@ def test_what_the_core_has_not_taken_is_not_sent_again(play, tmp_path):
         sim.publish(transitions(sequence=3))
         sim.publish(transitions(run_id='another'))
         play.links['reward'].publish(step_rewards(run_id='another'))
-        play.claimed = {'transitions': -1, 'step_rewards': -1}  # those are not of this run
+        # two are not of this run; and number 3 is waited for as long as it counts as published
+        play.claimed = {'transitions': -2, 'step_rewards': -1}
         refused = [('refused step_rewards', '1'), ('refused transitions', '2')]
         play.until(
             lambda: any(

@@ -14,6 +14,7 @@ from codetr_ros.nodes import (
     catching_up,
     fetching,
     keeping,
+    ledger,
     outbox,
     patience,
     peers,
@@ -127,8 +128,7 @@ def forget_the_last_phases(patch):
 
 def count_strangers(patch):
     def decode(self, kind, data, again=None):
-        self.received[TOPICS[kind]] += 1
-        self.run_id = 'nobody'  # so that the real one counts nothing
+        self.run_id = ''  # any
         return real(self, kind, data, again)
 
     real = traffic.Traffic.decode
@@ -236,12 +236,27 @@ def keep_policies_and_labels_in_any_order(patch):
     patch.setattr(recorder.Recorder, '_place', place)
 
 
+def forget_early_records(patch):
+    patch.setattr(ledger.Ledger, 'set_aside', lambda self, record: None)
+    patch.setattr(recorder.Recorder, 'still_due', lambda self, record: False)
+
+
+def count_what_was_late_twice(patch):
+    def arrived(self, record, sender, stamp):
+        if sender:
+            self._account(sender).again.clear()
+        real(self, record, sender, stamp)
+
+    real = ledger.Ledger.arrived
+    patch.setattr(ledger.Ledger, 'arrived', arrived)
+
+
 def leave_the_bag_of_a_killed_recorder_as_it_is(patch):
     patch.setattr(reopening, 'mend', lambda folder, disk: None)
 
 
 def ask_nobody_what_a_killed_recorder_has_missed(patch):
-    patch.setattr(keeping.Keeping, 'go_on', lambda self: self._by.begin_counting_anew())
+    patch.setattr(keeping.Keeping, 'go_on', lambda self: self._traffic.ledger.forgive())
 
 
 def begin_from_the_start(patch):
@@ -314,6 +329,8 @@ MENDS: dict[Callable, str] = {
     never_ask_for_policies: 'gave up',
     never_sweep: 'gave up',
     keep_policies_and_labels_in_any_order: 'not sound',
+    forget_early_records: 'not sound|were published on|gave up',
+    count_what_was_late_twice: 'not sound|were published on',
     leave_the_bag_of_a_killed_recorder_as_it_is: 'not sound|gave up|cannot be read|fault',
     ask_nobody_what_a_killed_recorder_has_missed: 'not sound|gave up',
     begin_from_the_start: 'gave up|other weights|stuck|not sound|fault',
@@ -370,7 +387,19 @@ def lost_and_killed(planned):
     return plan(583)
 
 
+def slow_and_lossy(planned):
+    """The same run, but that many messages never reach the recorder, and all take their time."""
+    planned = lossy(planned)
+    return replace(planned, weather=Weather(delay=0.5, overrun=0.2))
+
+
+def crowded(planned):
+    """The same run, but that some never reaches the recorder, and strangers publish a lot."""
+    return replace(planned, weather=replace(planned.weather, overrun=0.05, strangers=0.3))
+
+
 PLANS = {
+    count_strangers: crowded,
     forget_who_has_ended: overtaken,
     accept_gaps: overrun,
     wait_with_all_others: unanswered,
@@ -380,6 +409,8 @@ PLANS = {
     never_ask_for_policies: lossy,
     never_sweep: lossy,
     keep_policies_and_labels_in_any_order: lossy,
+    forget_early_records: slow_and_lossy,
+    count_what_was_late_twice: slow_and_lossy,
     leave_the_bag_of_a_killed_recorder_as_it_is: deadly,
     ask_nobody_what_a_killed_recorder_has_missed: deadly,
     begin_from_the_start: deadly,

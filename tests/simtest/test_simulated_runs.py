@@ -15,7 +15,7 @@ from codetr_ros.simtest.process import Pace
 from codetr_ros.simtest.run import carry_out, simulate
 
 QUICK, MANY = range(24), range(24, 120)
-FOUND = (43, 475, 583)
+FOUND = (43, 475, 583, 792, 50070)
 """Seeds beyond those that once failed."""
 
 
@@ -29,6 +29,14 @@ def test_a_few_seeds_end_as_if_nothing_had_happened_or_by_name():
 
 def test_seeds_that_once_failed_end_as_if_nothing_had_happened_or_by_name():
     assert failures(FOUND) == {}
+
+
+def test_no_loss_is_hidden_where_many_messages_never_reach_the_recorder():
+    for seed in (47, 51, 285):
+        planned = plan(seed)
+        weather = replace(planned.weather, overrun=0.1)
+        planned = replace(planned, weather=weather, deaths=(), disk=Trouble())
+        assert carry_out(replace(planned, checkpoints=Trouble())).failures == []
 
 
 @pytest.mark.slow

@@ -254,6 +254,20 @@ def decode_sent(
     return record_of(record_type, values), getattr(message, 'sender', '')
 
 
+def sender_of(record_type: type, data: bytes) -> str:
+    """Who sent a message, also where its content is no sound record; empty if not stated.
+
+    Args:
+        record_type: what it should be.
+        data: CDR.
+    """
+    name = type_name(record_type)
+    try:
+        return str(getattr(_reading(name, OWN)[0].deserialize_cdr(data, name), 'sender', ''))
+    except _UNREADABLE:
+        return ''
+
+
 def stamp_of(data: bytes) -> int:
     """When a message was published [ns], from its CDR bytes: the first field of all our types.
 

@@ -190,6 +190,8 @@ class Recorder(Part):
     def leave_out(self, sources: Collection[str]) -> list[str]:
         """Leave sources out of the phase that is waited for: nothing comes from them. If nothing
         came from any source, nobody is left out, because a phase without steps teaches nothing.
+        Neither is anybody before all have announced what they simulate, because nobody could learn
+        from the bag.
 
         Args:
             sources: names of those that are silent.
@@ -198,7 +200,8 @@ class Recorder(Part):
             The names of those that are left out now and were not before.
         """
         members = self._members(self.phase)
-        if not any(self._there(self.phase, source, n) for source, n in members.items()):
+        there = any(self._there(self.phase, source, n) for source, n in members.items())
+        if not self._tasks.known or not there:
             return []
         new = [
             source

@@ -62,8 +62,7 @@ class Keeper:
         limit: how long it waits for others.
         leave_out_after: seconds of silence after which a source is left out; 0: never.
         make: makes what asks a node.
-        published: returns the counts of the records that were published for it, by topic.
-        begin_counting_anew: counts as lost only what is published from now on.
+        note_own: notes what it has published itself.
         log: its logger.
         stamp: returns the time that is written beside a message [ns].
         clock: monotonic time [s].
@@ -79,8 +78,7 @@ class Keeper:
     limit: Limit
     leave_out_after: float
     make: MakeAsks
-    published: 'Callable[[], Counter[str]]'
-    begin_counting_anew: Callable[[], None]
+    note_own: Callable[[], None]
     log: Any
     stamp: Callable[[], int]
     clock: Callable[[], float] = time.monotonic
@@ -141,7 +139,7 @@ class Keeping:
     def go_on(self) -> None:
         """Ask all nodes for what was missed, if the bag was there before."""
         if self._bag.gone_on:
-            self._by.begin_counting_anew()
+            self._traffic.ledger.forgive()
             self._sweeper.ask(self._nodes())
             self._missed_until = self._by.clock() + CATCH_UP
 
@@ -165,7 +163,7 @@ class Keeping:
     def _take_again(self, kind: type, raw: bytes) -> bool:
         """Take the bytes of a message that was sent again; returns whether it was new."""
         try:
-            new = self._take(self._traffic.fetched(kind, raw), raw)
+            new = self._take(self._traffic.sent_again(kind, raw), raw)
         except RecordError as error:
             self._traffic.refuse(kind, error)
             return False
@@ -192,6 +190,7 @@ class Keeping:
             return False
         if core.comes_early(record):  # something before it was lost
             self.early[TOPICS[type(record)]] += 1
+            traffic.ledger.set_aside(record)
             self._early[type(record), getattr(record, 'source', '')] = record
             self._sweeper.ask(self._nodes(WRITERS[TOPICS[type(record)]]))
             return False
@@ -306,7 +305,6 @@ class Keeping:
                 f'{source} is left out of phase {self._core.phase}: {why}. Its steps of the '
                 'phase are dropped; it joins again with a later one'
             )
-            self._by.begin_counting_anew()  # what it has not sent yet is dropped
 
     def _gone(self, peer: Peer, now: float) -> bool:
         """Whether a node is silent and all that it simulates is left out: nobody waits for it."""
@@ -332,14 +330,16 @@ class Keeping:
         Raises:
             NodeError: a node has ended too early, or records never arrived.
         """
-        traffic = self._traffic
-        arrived = traffic.received + traffic.recovered
-        missing = traffic.ledger.owed(self._by.published(), arrived)
-        traffic.lost_for_good = missing
-        settled, doing = self._settling.check(missing, seconds, self._by.clock())
+        self._by.note_own()
+        now = self._by.clock()
+        gone = [peer.presence.instance_id for peer in self._settling.gone(now)]
+        missing = self._traffic.ledger.owed(without=gone)
+        self._traffic.lost_for_good = missing
+        settled, doing = self._settling.check(missing, seconds, now)
         if not settled:
-            self._ask_again(missing)
-        elif self._sweeper.busy and self._by.clock() < self._missed_until:
+            self._sweeper.ask(self._traffic.ledger.owing(), lacking=True)
+            self._sweeper.check()
+        elif self._sweeper.busy and now < self._missed_until:
             self._sweeper.check()
             return False, 'waits for what others have published while it was away'
         elif self.without:

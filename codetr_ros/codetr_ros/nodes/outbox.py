@@ -14,6 +14,9 @@ NOT_KEPT = (Presence, RunSpec)
 """Published again and again, or by other means."""
 LABELS = type_name(StepRewards)
 
+Published = tuple[Record, int]
+"""A record, and when it was published [ns]."""
+
 
 class Outbox:
     """Records that a node has published, by phase; of the newest phases only.
@@ -31,8 +34,8 @@ class Outbox:
     def __init__(self, phase_steps: int, phases: int | None) -> None:
         self._phase_steps = phase_steps
         self._most = phases
-        self._phases: dict[int, dict[object, Record]] = {}
-        self._announced: dict[object, TaskSpec] = {}
+        self._phases: dict[int, dict[object, Published]] = {}
+        self._announced: dict[object, Published] = {}
         self._phase = 0  # of the last record that named one
         self._asked = -1  # the newest phase of which a reader has asked for the labels alone
 
@@ -61,11 +64,16 @@ class Outbox:
             return False
         oldest = min(self._phases)
         return oldest >= self._asked and any(
-            isinstance(record, StepRewards) for record in self._phases[oldest].values()
+            isinstance(record, StepRewards) for record, _ in self._phases[oldest].values()
         )
 
-    def keep(self, record: Record) -> None:
-        """Keep a record that is published; one that was published before takes its place."""
+    def keep(self, record: Record, stamp: int) -> None:
+        """Keep a record that is published.
+
+        Args:
+            record: the record.
+            stamp: when it is published [ns].
+        """
         if isinstance(record, NOT_KEPT):
             return
         phase = phase_of(record, self._phase_steps)
@@ -73,12 +81,12 @@ class Outbox:
             self._phase = phase
         key = type(record), identity(record)
         if isinstance(record, TaskSpec):
-            self._announced[key] = record
-        self._phases.setdefault(self._phase, {})[key] = record
+            self._announced[key] = record, stamp
+        self._phases.setdefault(self._phase, {})[key, stamp] = record, stamp
         while self._most is not None and len(self._phases) > self._most:
             del self._phases[min(self._phases)]
 
-    def read(self, phase: int, kinds: Collection[str] = ()) -> Iterator[Record]:
+    def read(self, phase: int, kinds: Collection[str] = ()) -> Iterator[Published]:
         """The records of a phase, in the order in which they were published. Announcements, where
         they are named, come before them, whenever they were published.
 
@@ -94,9 +102,9 @@ class Outbox:
         if phase not in self._phases:
             held = ', '.join(map(str, sorted(self._phases))) or 'none yet'
             raise KeyError(f'nothing of phase {phase} is kept; of these is: {held}')
-        of_all_time = self._announced if kinds else {}
+        of_all_time = self._announced.values() if kinds else ()
         return (
-            record
-            for record in (of_all_time | self._phases[phase]).values()
+            (record, stamp)
+            for record, stamp in dict.fromkeys((*of_all_time, *self._phases[phase].values()))
             if not kinds or type_name(type(record)) in kinds
         )

@@ -5,12 +5,11 @@ subscriptions cannot distinguish a recorder from `ros2 topic echo`. From then on
 (reliable, deep enough queues). The counts that peers publish show a node what never reached it.
 """
 
-from collections import Counter, deque
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 
 from codetr_ros.config import Settings
-from codetr_ros.records import TOPICS, Metrics, Presence, roles
+from codetr_ros.records import Presence, roles
 from codetr_ros.records.roles import TABLE
 from codetr_ros.system.liveness import has_ended
 
@@ -235,63 +234,3 @@ class Peers:
     def anybody_left(self) -> bool:
         """Whether any peer has not finished."""
         return any(not peer.presence.finished for peer in self.newest())
-
-    def published(self) -> 'Counter[str]':
-        """Counts of the records that all peers have published, by topic."""
-        total: Counter[str] = Counter()
-        for peer in self.by_instance.values():
-            total.update(peer.published)
-        return total
-
-    def published_to_us(self, own: Mapping[str, int]) -> 'Counter[str]':
-        """Counts of the records that were published for this node to receive, by topic.
-
-        Args:
-            own: counts of those that it has published itself.
-        """
-        published = self.published()
-        if self.role == 'record':  # it reads what it publishes, but for its commits
-            published[TOPICS[Metrics]] += own.get(TOPICS[Metrics], 0)
-        return published
-
-
-class Ledger:
-    """Counts records that were published but never arrived.
-
-    A `Presence` may overtake the messages that it counts. So a record counts as lost only when it
-    has not arrived `patience` seconds after a presence that counts it.
-    """
-
-    def __init__(self, patience: float = 5.0) -> None:
-        self._patience = patience
-        self._published: deque[tuple[float, Counter[str]]] = deque()  # times, counts by then
-        self._due: Counter[str] = Counter()
-        self._forgiven: Counter[str] = Counter()
-
-    def forgive(self, published: 'Counter[str]', received: 'Counter[str]') -> None:
-        """Begin to count anew, by topic: what is under way now may never arrive, since who sent it
-        was killed and sends it again, or who counts was. It does not count as lost.
-        """
-        self._published.clear()
-        self._due.clear()
-        self._forgiven = Counter(published)
-        self._forgiven.subtract(received)
-
-    def owed(self, published: 'Counter[str]', received: 'Counter[str]') -> dict[str, int]:
-        """Counts of records that were published and have not arrived, whenever that was."""
-        return {
-            topic: lacking
-            for topic, n in sorted(published.items())
-            if (lacking := n - received[topic] - max(0, self._forgiven[topic])) > 0
-        }
-
-    def note(self, published: 'Counter[str]', now: float) -> None:
-        """Note the counts of the records that peers have published by now, by topic."""
-        if not self._published or self._published[-1][1] != published:
-            self._published.append((now, published))
-
-    def lost(self, received: 'Counter[str]', now: float) -> dict[str, int]:
-        """Counts of the lost records, for topics that lost any."""
-        while self._published and self._published[0][0] <= now - self._patience:
-            self._due = self._published.popleft()[1]
-        return self.owed(self._due, received)

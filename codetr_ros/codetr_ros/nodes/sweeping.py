@@ -15,6 +15,8 @@ UNNEWS = 3
 something is known to be lacking.
 """
 
+Messages = list[tuple[type, bytes]]
+"""Kind and bytes of each."""
 TakeAgain = Callable[[type, bytes], bool]
 """Takes the bytes of a message that was sent again; returns whether it was new."""
 
@@ -48,7 +50,10 @@ class Sweeper:
         self._asked: dict[str, float] = {}  # when each has answered last
         self._thorough: set[str] = set()  # nodes that are to be asked for all that they keep
         self._present: str | None = None  # the node that is asked
-        self._phases: list[list[tuple[type, bytes]]] = []  # what it has sent, newest first
+        self._phases: list[Messages] = []  # what it has sent, newest first
+        self._phase = NEWEST  # which it is asked for
+        self._broken_off: dict[str, tuple[list[Messages], int]] = {}  # of nodes: both of these
+        self._goes_on = False  # whether it was broken off right before that
         self._round = 0  # counts questions
         self._news = 0  # phases since one had something new
 
@@ -76,19 +81,24 @@ class Sweeper:
         if self._present is not None:
             if self._asker(service_of(self._present)).busy:
                 return
-            self._wanted[self._present] = 0.0  # it was killed meanwhile: ask it once more
+            # it was killed meanwhile, or the answer was lost: ask it once more, from there on
+            self._wanted[self._present] = 0.0
+            self._broken_off[self._present] = self._phases, self._phase
             self._end()
         now = self._clock()
         for node in [node for node, due in self._wanted.items() if due <= now]:
             if self._asker(service_of(node)).ready:
                 del self._wanted[node]
-                self._present, self._phases, self._news = node, [], 0
-                self._ask(NEWEST)
+                self._present, self._news = node, 0
+                self._goes_on = node in self._broken_off
+                self._phases, phase = self._broken_off.pop(node, ([], NEWEST))
+                self._ask(phase)
                 return
 
     def _ask(self, phase: int) -> None:
         node = self._present
         assert node is not None
+        self._phase = phase
         self._round += 1
         asked = self._round
         asker = self._asker(service_of(node))
@@ -97,9 +107,14 @@ class Sweeper:
     def _answered(self, asked: int, answer: Answer) -> None:
         if asked != self._round or self._present is None:
             return  # too late: it was given up, or another node is asked
-        if answer.phase is None:  # it keeps nothing earlier
-            self._end()
+        if answer.phase is None:  # it keeps nothing earlier, or was started again since
+            if self._goes_on:
+                self._goes_on = False
+                self._ask(NEWEST)
+            else:
+                self._end()
             return
+        self._goes_on = False
         self._phases.append(answer.messages)
         new = any(not self._known(kind, data) for kind, data in answer.messages)
         self._news = 0 if new else self._news + 1
@@ -113,7 +128,8 @@ class Sweeper:
         node, phases = self._present, self._phases
         assert node is not None
         self._present, self._phases = None, []
-        self._thorough.discard(node)
+        if node not in self._broken_off:
+            self._thorough.discard(node)
         self._asked[node] = self._clock()
         sent = [message for messages in reversed(phases) for message in messages]
         if new := sum(self._take(kind, data) for kind, data in sent):

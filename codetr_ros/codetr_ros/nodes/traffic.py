@@ -6,11 +6,12 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from codetr_ros.bags.definitions import decode_sent
+from codetr_ros.bags.definitions import decode_sent, sender_of, stamp_of
 from codetr_ros.config import Settings
 from codetr_ros.cores.core import Core, Silent
 from codetr_ros.nodes.admission import Admission, Unknown
-from codetr_ros.nodes.peers import Ledger, Peer
+from codetr_ros.nodes.ledger import Ledger
+from codetr_ros.nodes.peers import Peer
 from codetr_ros.records import (
     TOPICS,
     Commit,
@@ -105,8 +106,8 @@ class Traffic:
         admission: decides whose messages are taken.
         received: messages of this run that arrived, sound or not.
         refused: those of them that were refused.
-        recovered: records that were lost, and arrived when fetched again.
-        ledger: counts of the records that peers have published.
+        recovered: records that had not arrived, and did when they were fetched again.
+        ledger: counts what peers have published and what of it has arrived.
         lost_for_good: records that will not arrive any more, once that is certain.
         early: takes a record of a phase that cannot have begun yet, with the reason for which it
             would be refused; returns whether it holds it. None: all of them are refused.
@@ -180,6 +181,7 @@ class Traffic:
             return None
         now = self._clock()
         ours = kind not in (Presence, RunSpec)  # of which nothing is missed
+        record, sender = None, ''
         try:
             record, sender = arrived(kind, data)
             # what is of another run must not stand in for what is lost of this one
@@ -196,6 +198,9 @@ class Traffic:
         finally:
             if ours:
                 self.received[TOPICS[kind]] += 1  # sound or not, it is not lost
+                sender = sender or sender_of(kind, data)
+                if sender:
+                    self.ledger.arrived(record or kind, sender, stamp_of(data))
         if kind is Presence:
             self._take_kept(sender)
         return record
@@ -261,9 +266,22 @@ class Traffic:
         Raises:
             RecordError: it is no message, is not signed, or its sender may not publish it.
         """
+        return self._fetched(kind, data)[0]
+
+    def _fetched(self, kind: type, data: bytes) -> tuple[Record, str]:
         self.admission.check_signature(kind, data)
         record, sender = arrived(kind, data)
         self.admission.check_again(record, sender)
+        return record, sender
+
+    def sent_again(self, kind: type, data: bytes) -> Record:
+        """The record in a message that was fetched again: it counts as one that has arrived.
+
+        Raises:
+            RecordError: it is no message, is not signed, or its sender may not publish it.
+        """
+        record, sender = self._fetched(kind, data)
+        self.ledger.sent_again(record, sender, stamp_of(data))
         return record
 
     def take_again(self, kind: type, data: bytes, lost: bool = False) -> None:
@@ -275,7 +293,7 @@ class Traffic:
             lost: whether it is certain that it was lost, though it is a commit.
         """
         try:
-            self.receive_again(self.fetched(kind, data), lost)
+            self.receive_again(self.sent_again(kind, data), lost)
         except RecordError as error:
             self.refuse(kind, error)
 
@@ -309,7 +327,7 @@ class Traffic:
         if self.lost_for_good is not None:
             return self.lost_for_good
         wanted = [TOPICS[k] for k in self.core.subscribes] if topics is None else topics
-        lost = self.ledger.lost(self.received + self.recovered, self._clock())
+        lost = self.ledger.lost(self._clock())
         return {topic: n for topic, n in lost.items() if topic in wanted}
 
     def left_out(self, peer: Peer) -> bool:

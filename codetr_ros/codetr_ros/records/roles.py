@@ -187,3 +187,7 @@ def readers(labelled: bool = True) -> dict[str, tuple[str, ...]]:
 
 WRITERS = _by_topic(lambda role: TABLE[role].publishes)
 """Roles that publish on a topic, by topic."""
+
+READ_BY_ITSELF = {'record': (TOPICS[Metrics],)}
+"""Topics on which a role receives what it publishes itself. It writes its commits to the bag
+before it publishes them."""

@@ -127,18 +127,24 @@ class Link:
                     message_type, topic, qos.profile(topic, settings)
                 )
 
-    def publish(self, record: Record) -> None:
-        """Publish a record on its topic and count it."""
+    def publish(self, record: Record) -> int:
+        """Publish a record on its topic and count it; returns its stamp [ns]."""
         self.send(TOPICS[type(record)], self.message(record))
         self._plots.publish(record)
+        return self._stamp
 
-    def message(self, record: Record) -> bytes:
-        """The bytes of a record's message, stamped with the present time, and signed if the run
-        has a key. No two stamps are the same, and none is before another, even if the clock is set
-        back: receivers refuse what is older than what they have.
+    def message(self, record: Record, stamp: int | None = None) -> bytes:
+        """The bytes of a record's message, signed if the run has a key.
+
+        Args:
+            record: the record.
+            stamp: when it was published [ns], if it is sent again. None: now. No two stamps are
+                the same, and none is before another, even if the clock is set back: receivers
+                refuse what is older than what they have, and count each message once.
         """
-        self._stamp = max(self.node.get_clock().now().nanoseconds, self._stamp + 1)
-        data = encode(record, self._stamp, sender=self.instance)
+        if stamp is None:
+            stamp = self._stamp = max(self.node.get_clock().now().nanoseconds, self._stamp + 1)
+        data = encode(record, stamp, sender=self.instance)
         if self.key is None:
             return data
         return signed(self.key, self.topic(type(record)), data)

@@ -2,13 +2,13 @@
 
 import hashlib
 import time
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from codetr_ros.bags.definitions import stamp_of
 from codetr_ros.config import Settings, SettingsError, from_canonical
 from codetr_ros.cores.core import Core
 from codetr_ros.nodes.admission import Admission
@@ -28,7 +28,7 @@ from codetr_ros.records import (
     describe,
 )
 from codetr_ros.records.bounds import LONGEST_DOING
-from codetr_ros.records.roles import published_by
+from codetr_ros.records.roles import READ_BY_ITSELF, published_by
 from codetr_ros.ros import given, link, parameters
 from codetr_ros.ros.fetch import askers
 from codetr_ros.ros.link import Link
@@ -203,9 +203,9 @@ class Membership:
     def publish(self, record: Record) -> None:
         """Publish a record of the node's core."""
         assert not self.outside
+        stamp = self.link.publish(record)
         if self._outbox is not None:
-            self._outbox.keep(record)
-        self.link.publish(record)
+            self._outbox.keep(record, stamp)
 
     def catch_up(self, newest: int) -> None:
         """Fetch all phases up to a committed one that the core has not taken in."""
@@ -220,12 +220,13 @@ class Membership:
 
     def begin_counting_anew(self) -> None:
         """Count as lost only what is published from now on and never arrives."""
-        traffic = self.traffic
-        traffic.ledger.forgive(self.all_published(), traffic.received + traffic.recovered)
+        self.traffic.ledger.forgive()
 
-    def all_published(self) -> 'Counter[str]':
-        """Counts of the records that were published for this node to receive, by topic."""
-        return self.peers.published_to_us(self.link.published)
+    def note_own(self) -> None:
+        """Note what this node has published that it receives itself."""
+        own = {topic: self.link.published[topic] for topic in READ_BY_ITSELF.get(self.role, ())}
+        if own:
+            self.traffic.ledger.note_own(self.link.instance, own, time.monotonic())
 
     def turn(self, wait: float = 0.0) -> None:
         """Give ROS its turn: take what arrived, and publish the presence when it is due.
@@ -251,7 +252,7 @@ class Membership:
             return
         try:
             if isinstance(record, Presence):
-                self._note_peer(record)
+                self._note_peer(record, stamp_of(data))
             elif isinstance(record, RunSpec):
                 self._note_run(record, data)
             elif not self._later(record):
@@ -260,7 +261,10 @@ class Membership:
             self.traffic.refuse(kind, error)
 
     def _later(self, record: Record) -> bool:
-        return self._fetcher is not None and self._fetcher.later(record, self.traffic.core)
+        later = self._fetcher is not None and self._fetcher.later(record, self.traffic.core)
+        if later:
+            self.traffic.ledger.set_aside(record)
+        return later
 
     @property
     def runs_away(self) -> bool:
@@ -316,7 +320,7 @@ class Membership:
         self.traffic.received['run'] += 1
         self.run, self.announcement = spec, data
 
-    def _note_peer(self, presence: Presence) -> None:
+    def _note_peer(self, presence: Presence, stamp: int) -> None:
         if presence.instance_id == self.link.instance:
             return
         own = self.run.run_id if self.run else ''
@@ -339,9 +343,8 @@ class Membership:
         news = self.peers.note(presence, now)
         if news:
             self.log.info(news)
-            if self.peers.restarted(presence) and not presence.finished:
-                self.begin_counting_anew()  # what the one before has not sent is sent anew
-        self.traffic.ledger.note(self.all_published(), now)
+        self.traffic.ledger.note(presence, stamp, now)
+        self.note_own()
 
     def _log_once(self, text: str) -> None:
         if text not in self._logged:

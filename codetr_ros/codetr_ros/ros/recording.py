@@ -16,7 +16,6 @@ from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any, cast
 
-from codetr_ros.bags.definitions import decode
 from codetr_ros.bags.topics import RECORDED, topics_of_run
 from codetr_ros.cores.recorder import Recorder
 from codetr_ros.nodes.asking import SERVICE
@@ -51,8 +50,8 @@ class Recording(Wiring):
             round(member.values['bag_split_mb'] * 1e6),
             round(member.values['bag_keep_free_mb'] * 1e6),
         )
-        # the newest commits, as bytes: published again by a recorder that was started again
-        self._commits: deque[bytes] = deque(maxlen=settings.ahead + 1)
+        # the newest commits: published again by a recorder that was started again
+        self._commits: deque[Commit] = deque(maxlen=settings.ahead + 1)
         self._keeping = Keeping(
             Keeper(
                 who=member.link.full_name,
@@ -65,8 +64,7 @@ class Recording(Wiring):
                 limit=member.limit,
                 leave_out_after=member.values['leave_out_after'],
                 make=askers(member.link, joined.run.run_id),
-                published=member.all_published,
-                begin_counting_anew=member.begin_counting_anew,
+                note_own=member.note_own,
                 log=member.log,
                 stamp=lambda: member.link.node.get_clock().now().nanoseconds,
             )
@@ -87,9 +85,8 @@ class Recording(Wiring):
             if kind not in (RunSpec, Commit):  # the first has arrived, the second is our own
                 link.subscribe(kind, self.take, settings)
         PhaseService(link, SERVICE, run_id, self._read, lambda: bag.newest)
-        for data in self._commits:  # and by the counts of its presence others know of them
-            known = link.is_signed(Commit, data)  # else all nodes are new, and take none of ours
-            link.send(TOPICS[Commit], data if known else link.message(decode(Commit, data)))
+        for commit in self._commits:  # and by the counts of its presence others know of them
+            link.publish(commit)
 
     def _read(self, phase: int, kinds: Collection[str]) -> Iterable[tuple[type, bytes]]:
         """The messages of a phase, as the nodes of this run take them."""
@@ -101,7 +98,7 @@ class Recording(Wiring):
     def _restore(self, record: Record, data: bytes) -> None:
         """Take a record that the bag holds already."""
         if isinstance(record, Commit):
-            self._commits.append(data)
+            self._commits.append(record)
         self._keeping.restore(record)
 
     def go_on(self) -> bool:

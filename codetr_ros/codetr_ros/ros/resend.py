@@ -136,6 +136,7 @@ def serve_outbox(link: Link, run_id: str, outbox: Outbox) -> None:
     """Offer to send again what a node has published lately."""
 
     def read(phase: int, kinds: Collection[str]) -> list[tuple[type, bytes]]:
-        return [(type(record), link.message(record)) for record in outbox.read(phase, kinds)]
+        there = outbox.read(phase, kinds)
+        return [(type(record), link.message(record, stamp)) for record, stamp in there]
 
     PhaseService(link, service_of(link.full_name), run_id, read, lambda: outbox.newest)

@@ -16,7 +16,7 @@ from codetr_ros.records import (
     StepRewards,
     Transitions,
 )
-from codetr_ros.simtest.disks import TroubledDisk
+from codetr_ros.records.digests import digest
 from codetr_ros.simtest.process import Process
 
 if TYPE_CHECKING:
@@ -32,9 +32,13 @@ OF_A_CUT = ('without its index: its writer was killed', NO_TRUE_REWARDS)
 nobody learns."""
 
 
-def early_commit(kind: type, raw: bytes, reader: Process, disk: TroubledDisk) -> str | None:
+def early_commit(kind: type, raw: bytes, reader: Process, run: 'Simulated') -> str | None:
     """A commit that arrives before it would outlast a loss of power, in words."""
-    if kind is not Commit or disk.holds(raw) or decode(kind, raw).run_id != reader.run.run_id:
+    if kind is not Commit:
+        return None
+    commit = decode(kind, raw)
+    kept = run.recording.bag.commits.get(digest(commit))
+    if commit.run_id != reader.run.run_id or (kept is not None and run.disk.holds(kept)):
         return None
     return f'a commit reaches {reader.name} before it is on the disk'
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
-from codetr_ros.bags.definitions import decode, encode
+from codetr_ros.bags.definitions import decode, encode, stamp_of
 from codetr_ros.bags.topics import RECORDED
 from codetr_ros.records import CompositeReward, Presence, Record, Transitions
 from codetr_ros.simtest.network import FORGED, Handle, Network, Weather
@@ -66,7 +66,8 @@ class Post:
         self.network.publish(sender.name, readers, kind, lambda name: self._arrives(name, packet))
         if kind is not Presence and self._world.rng.random() < self._weather.strangers:
             strange = replace(decode(kind, packet.data), run_id=STRANGER)
-            other = Packet(kind, self._world.number(), encode(strange))
+            claimed = encode(strange, stamp_of(packet.data) + 1, sender=sender.instance)
+            other = Packet(kind, self._world.number(), claimed)
             self.network.publish(STRANGER, readers, kind, lambda name: self._arrives(name, other))
 
     def deliver_lasting(self, reader: Process) -> None:

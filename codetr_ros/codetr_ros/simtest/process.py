@@ -32,7 +32,7 @@ from codetr_ros.nodes.restoring import (
 )
 from codetr_ros.nodes.traffic import Traffic
 from codetr_ros.records import TOPICS, Commit, Presence, Record, RunSpec, describe
-from codetr_ros.records.roles import published_by
+from codetr_ros.records.roles import READ_BY_ITSELF, published_by
 from codetr_ros.simtest.asking import Asker, FetchAnswer, FetchRequest
 from codetr_ros.simtest.disks import KilledError
 from codetr_ros.simtest.network import KEPT_FOR_LATE
@@ -50,11 +50,13 @@ class Packet:
         kind: what it carries.
         number: one for each message, by which a second copy shows.
         data: CDR; a record as it is for presences, which are many.
+        stamp: when a presence was published [ns].
     """
 
     kind: type
     number: int
     data: Any
+    stamp: int = 0
 
 
 class Mail(Protocol):
@@ -153,6 +155,7 @@ class Process:
         self.place, self.core = place, core
         self.world, self.mail, self.run = place.world, place.mail, place.run
         self.role, self.name = place.role, place.name
+        self.instance = f'{place.name}#{place.instance}'
         self.error: Exception | None = None
         self.over = self.ended = self.killed = self.finished = False
         self.ended_at = 0.0
@@ -189,6 +192,7 @@ class Process:
         self._inbox: deque[Packet] = deque()
         self._seen: set[int] = set()
         self._presence_at = -PRESENCE_EVERY
+        self._stamp = 0  # of the newest message [ns]
         self._waiting: float | None = None  # since when [s]
         self._begun = False
         self._was_held = False
@@ -367,7 +371,7 @@ class Process:
 
     def _take(self, packet: Packet) -> None:
         if isinstance(packet.data, Presence):
-            self._note_peer(packet.data)
+            self._note_peer(packet.data, packet.stamp)
         elif isinstance(packet.data, FetchAnswer):
             asker = self._asked.pop(packet.data.number, None)
             if asker is not None:
@@ -379,22 +383,22 @@ class Process:
             self._seen.add(packet.number)
             self.take(packet.kind, packet.data)
 
-    def _note_peer(self, presence: Presence) -> None:
+    def _note_peer(self, presence: Presence, stamp: int) -> None:
         news = self.peers.note(presence, self.world.now)
         if news:
             self.world.note(self.name, news)
-            if self.peers.restarted(presence) and not presence.finished:
-                self.begin_counting_anew()
-        self.traffic.ledger.note(self.all_published(), self.world.now)
+        self.traffic.ledger.note(presence, stamp, self.world.now)
+        self.note_own()
 
-    def all_published(self) -> 'Counter[str]':
-        """Counts of the records that were published for this node to receive, by topic."""
-        return self.peers.published_to_us(self.published)
+    def note_own(self) -> None:
+        """Note what this node has published that it receives itself."""
+        own = {topic: self.published[topic] for topic in READ_BY_ITSELF.get(self.role, ())}
+        if own:
+            self.traffic.ledger.note_own(self.instance, own, self.world.now)
 
     def begin_counting_anew(self) -> None:
         """Count as lost only what is published from now on and never arrives."""
-        traffic = self.traffic
-        traffic.ledger.forgive(self.all_published(), traffic.received + traffic.recovered)
+        self.traffic.ledger.forgive()
 
     def take(self, kind: type, raw: bytes) -> None:
         """Take the bytes of a message."""
@@ -407,6 +411,8 @@ class Process:
     def _later(self, record: Record) -> bool:
         later = self._fetcher.later(record, self.core)
         self.set_aside[TOPICS[type(record)]] += later
+        if later:
+            self.traffic.ledger.set_aside(record)
         return later
 
     def make_asker(self, service: str) -> Asker:
@@ -426,18 +432,26 @@ class Process:
         """What the node answers: it sends again what it has published."""
 
         def read(phase: int, kinds: Any) -> list[tuple[type, bytes]]:
-            return [(type(r), self._encoded(r)) for r in self._outbox.read(phase, kinds)]
+            there = self._outbox.read(phase, kinds)
+            return [(type(each), self.message(each, stamp)) for each, stamp in there]
 
         outbox = self._outbox
         return answer_to(request.phase, request.kinds, read, lambda: outbox.newest, self.log)
 
-    def _encoded(self, record: Record) -> bytes:
-        return encode(record, round(self.world.now * 1e9))
+    def stamp(self) -> int:
+        """The present time [ns], and never the same twice."""
+        self._stamp = max(round(self.world.now * 1e9), self._stamp + 1)
+        return self._stamp
+
+    def message(self, record: Record, stamp: int) -> bytes:
+        """The bytes of a record's message."""
+        return encode(record, stamp, sender=self.instance)
 
     def deliver(self, record: Record) -> None:
         """Publish a record of the core."""
-        self._outbox.keep(record)
-        self.publish(record, self._encoded(record))
+        stamp = self.stamp()
+        self._outbox.keep(record, stamp)
+        self.publish(record, self.message(record, stamp))
 
     def publish(self, record: Record, raw: bytes) -> None:
         """Publish the bytes of a record."""
@@ -465,7 +479,7 @@ class Process:
             run_id=self.run.run_id,
             role=self.role,
             node=f'/{self.name}',
-            instance_id=f'{self.name}#{self.place.instance}',
+            instance_id=self.instance,
             settings_hash='' if self.error else self.run.settings_hash,
             finished=over,
             topics=topics,
@@ -474,7 +488,7 @@ class Process:
             doing=doing,
             waiting=waiting,
         )
-        self.mail.publish(self, Packet(Presence, 0, presence))
+        self.mail.publish(self, Packet(Presence, 0, presence, self.stamp()))
 
     # ---- the end
 

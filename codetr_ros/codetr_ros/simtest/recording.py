@@ -13,6 +13,7 @@ from codetr_ros.nodes.asking import Answer, answer_to
 from codetr_ros.nodes.keeping import Keeper, Keeping
 from codetr_ros.nodes.kept_run import KeptRun
 from codetr_ros.records import TOPICS, Commit, Record, RunSpec
+from codetr_ros.records.digests import digest
 from codetr_ros.simtest.asking import FetchRequest
 from codetr_ros.simtest.disks import TroubledDisk
 from codetr_ros.simtest.process import Place, Process
@@ -26,16 +27,24 @@ class _Bag(KeptRun):
 
     Attributes:
         history: kind and bytes of each message in it, in its order.
+        commits: bytes of each commit in it, by its digest.
     """
 
     history: list[tuple[type, bytes]]
+    commits: dict[str, bytes]
 
     def write(
         self, record: Record, data: bytes, log_time: int, published: int | None = None
     ) -> None:
         """Append a record."""
         super().write(record, data, log_time, published)
+        self.remember(record, data)
+
+    def remember(self, record: Record, data: bytes) -> None:
+        """Note what is in the bag."""
         self.history.append((type(record), data))
+        if isinstance(record, Commit):
+            self.commits[digest(record)] = data
 
 
 class Recording(Process):
@@ -73,9 +82,9 @@ class Recording(Process):
             chunk_bytes=CHUNK_BYTES,
             disk=disk,
         )
-        self.bag.history = []
+        self.bag.history, self.bag.commits = [], {}
         # the newest commits are published again by a recorder that was started again
-        self._commits: deque[tuple[Commit, bytes]] = deque(maxlen=settings.ahead + 1)
+        self._commits: deque[Commit] = deque(maxlen=settings.ahead + 1)
         self._keeping = Keeping(
             Keeper(
                 who=f'/{self.name}',
@@ -88,8 +97,7 @@ class Recording(Process):
                 limit=self.limit,
                 leave_out_after=leave_out_after,
                 make=self.make_asker,
-                published=self.all_published,
-                begin_counting_anew=self.begin_counting_anew,
+                note_own=self.note_own,
                 log=self.log,
                 stamp=lambda: round(self.world.now * 1e9),
                 clock=self.now,
@@ -105,14 +113,14 @@ class Recording(Process):
         """
         self.bag.open(self.run.run_id, self._hold_already)
         if not self.bag.recorded[TOPICS[RunSpec]]:
-            self._write(self.run, self._encoded(self.run))
-        for commit, raw in self._commits:
-            self.publish(commit, raw)
+            self._write(self.run, self.message(self.run, self.stamp()))
+        for commit in self._commits:
+            self.publish(commit, self.message(commit, self.stamp()))
 
     def _hold_already(self, record: Record, data: bytes) -> None:
-        self.bag.history.append((type(record), data))
+        self.bag.remember(record, data)
         if isinstance(record, Commit):
-            self._commits.append((record, data))
+            self._commits.append(record)
         self._keeping.restore(record)
 
     def _write(self, record: Record, raw: bytes) -> None:
@@ -138,7 +146,7 @@ class Recording(Process):
 
     def deliver(self, record: Record) -> None:
         """Publish a record of the core; a commit only after all that it names is on the disk."""
-        raw = self._encoded(record)
+        raw = self.message(record, self.stamp())
         if isinstance(record, Commit):
             self._write(record, raw)
             self.bag.flush()

@@ -242,7 +242,7 @@ class Simulated:
 
     def _watch(self, kind: type, raw: bytes, reader: Process) -> None:
         """Look at what arrives at a consumer."""
-        if found := checks.early_commit(kind, raw, reader, self.disk):
+        if found := checks.early_commit(kind, raw, reader, self):
             self.failures.append(found)
 
     def run(self) -> Outcome:
