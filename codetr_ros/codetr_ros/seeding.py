@@ -6,6 +6,7 @@ its generators from (seed, core, phase, slice), and no generator state is ever s
 
 import hashlib
 import random
+from functools import cache
 
 import numpy as np
 import torch
@@ -24,7 +25,17 @@ def generator(seed: int, *names: str | int) -> np.random.Generator:
 
 def seed_torch(seed: int, *names: str | int) -> None:
     """Seed torch's global generators, from which dropout and `torch.randn` draw."""
-    torch.manual_seed(entropy(seed, *names) & (2**63 - 1))
+    number = entropy(seed, *names) & (2**63 - 1)
+    if _accelerated():
+        torch.manual_seed(number)
+    else:  # else each call is also noted for accelerators that may still come, with its stack
+        torch.default_generator.manual_seed(number)
+
+
+@cache
+def _accelerated() -> bool:
+    """Whether torch may compute on anything but processors."""
+    return torch.accelerator.is_available()
 
 
 def seed_global(seed: int, *names: str | int) -> None:

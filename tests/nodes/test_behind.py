@@ -1,13 +1,16 @@
 """A simulator that receives policies of phases which, as far as it knows, cannot have begun."""
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from codetr_ros.cores.simulator import Simulator
 from codetr_ros.nodes.behind import MOST, Behind
+from codetr_ros.nodes.peers import Peers
 from codetr_ros.nodes.traffic import Traffic
+from codetr_ros.records import Presence
 from helpers.builders import policy, run, tiny
 
 BOTH = ('sim', 'sim_2')
@@ -39,6 +42,23 @@ def test_it_goes_on_behind_what_is_committed_without_it(simulator):
     assert not traffic.refused
     traffic.receive(permission(7))  # it has that one
     assert core.duplicated == {'policy': 1}
+
+
+@pytest.mark.parametrize('settings_hash', ['', 'hash'], ids=['gave up', 'has finished'])
+def test_it_has_finished_once_a_recorder_has_that_did_not_wait_for_it(simulator, settings_hash):
+    core, traffic, behind = simulator()
+    peers = Peers('sim')
+    last = Presence(
+        run_id='run', role='record', node='/r/record', instance_id='record 1',
+        settings_hash=settings_hash, finished=False, topics=(),
+        published=np.zeros(0, np.uint64), missed=0,
+    )  # fmt: skip
+    peers.note(last, 0.0)
+    traffic.receive(permission(50))
+    assert not behind.over(peers) and not core.finished
+    peers.note(replace(last, finished=True), 1.0)
+    assert behind.over(peers) == core.finished == bool(settings_hash)
+    assert behind.asks == (not settings_hash)
 
 
 def test_policies_that_nobody_can_have_published_yet_are_refused(simulator):

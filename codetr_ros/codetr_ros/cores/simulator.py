@@ -239,9 +239,12 @@ class Simulator(Part):
         self.pass_over(committed + 1)
 
     def pass_over(self, phase: int) -> None:
-        """Go on with a phase: those before it are committed without this simulator."""
+        """Go on with a phase: those before it are committed without this simulator. Behind the
+        last it has finished.
+        """
         self._note_left_out(phase - self._phase)
         self._phase = phase
+        self.finished = phase >= self._settings.phases
         for before in [before for before in self._waiting if before < phase]:
             del self._waiting[before]
 

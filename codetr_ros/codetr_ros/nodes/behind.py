@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 from codetr_ros.config import Settings
+from codetr_ros.nodes.peers import Peers
 from codetr_ros.nodes.traffic import Traffic
 from codetr_ros.records import Policy, Record, RecordError
 
@@ -29,6 +30,7 @@ class Behind:
     def __init__(self, traffic: Traffic, core: 'Simulator', settings: Settings) -> None:
         self._traffic = traffic
         self._core = core
+        self._settings = settings
         self._held: dict[int, tuple[Policy, RecordError]] = {}  # with why it cannot be taken
         if not settings.alone:  # else no phase goes on without it
             traffic.early = self._hold
@@ -45,6 +47,19 @@ class Behind:
     def asks(self) -> bool:
         """Whether the simulator waits for a policy while it holds later ones."""
         return bool(self._held) and self._core.lacks_permission
+
+    def over(self, peers: Peers) -> bool:
+        """Whether the run is over: the recorder has finished, and did not wait for this simulator.
+        It then has nothing more to do, and nobody answers it any more.
+
+        Args:
+            peers: the other nodes.
+        """
+        if self._settings.alone or self._core.finished or not peers.recorded():
+            return False
+        self._held = {}
+        self._core.pass_over(self._settings.phases)
+        return True
 
     def answered(self, newest: int | None) -> None:
         """Go on where the run stands.

@@ -46,12 +46,15 @@ class _Account:
     came: 'OrderedDict[_Message, None]' = field(default_factory=OrderedDict)
     again: 'OrderedDict[_Message, None]' = field(default_factory=OrderedDict)
 
-    def note(self, published: 'Counter[str]', stamp: int, now: float) -> None:
+    def note(self, published: 'Counter[str]', stamp: int, now: float) -> bool:
+        """Note counts; returns whether they are new."""
         if stamp >= self.stamp:  # else an earlier one, which a later one has overtaken
             self.published, self.stamp = published, stamp
             self.newest = deque((each for each in self.newest if each[0] > stamp), maxlen=MOST)
-        if not self.dated or self.dated[-1][1] != published:
-            self.dated.append((now, published))
+        if (self.dated[-1][1] if self.dated else self.due) == published:
+            return False
+        self.dated.append((now, published))
+        return True
 
     def count(self, topic: str, stamp: int, by: int = 1) -> None:
         if stamp > self.since:
@@ -96,6 +99,8 @@ class Ledger:
         self._patience = patience
         self._by: dict[str, _Account] = {}
         self._instances: dict[str, str] = {}  # the newest of each node
+        self._lost: dict[str, int] | None = {}  # as it was found last; None: something has changed
+        self._lost_until = float('inf')  # when more may be lost, if nothing changes [s]
 
     def note(self, presence: Presence, stamp: int, now: float) -> None:
         """Note what a process has published by now. One that has taken the place of another begins
@@ -116,10 +121,12 @@ class Ledger:
     def _note(
         self, node: str, instance: str, published: Mapping[str, int], stamp: int, now: float
     ) -> None:
-        self._instances[node] = instance
         counts = Counter(published)
         del counts[TOPICS[RunSpec]]  # announced by other means, too
-        self._account(instance).note(counts, stamp, now)
+        news = self._account(instance).note(counts, stamp, now)
+        if news or self._instances.get(node) != instance:
+            self._instances[node] = instance
+            self._lost = None
 
     def _account(self, instance: str) -> _Account:
         return self._by.setdefault(instance, _Account())
@@ -137,6 +144,7 @@ class Ledger:
         account, message = self._account(sender), (stamp, _key(record))
         if message in account.came:
             return
+        self._lost = None
         if message not in account.again:
             kind = record if isinstance(record, type) else type(record)
             account.count(TOPICS[kind], stamp)
@@ -153,12 +161,14 @@ class Ledger:
         account, message = self._by.get(sender), (stamp, _key(record))
         if account is None or message in account.came or message in account.again:
             return
+        self._lost = None
         account.count(TOPICS[type(record)], stamp)
         _remember(account.again, message)
 
     def set_aside(self, record: Record) -> None:
         """Take back that a record has come on its topic: it is let go, and must be sent again."""
         key = _key(record)
+        self._lost = None
         for account in self._by.values():
             # it has just come, as a rule
             message = next((each for each in reversed(account.came) if each[1] == key), None)
@@ -170,6 +180,7 @@ class Ledger:
         """Begin to count anew: of what was published by now, nothing is owed. It was published for
         those who were there before.
         """
+        self._lost = None
         for account in self._by.values():
             account.forgive()
 
@@ -184,7 +195,12 @@ class Ledger:
 
     def lost(self, now: float) -> dict[str, int]:
         """Counts of the lost records, for topics that lost any."""
-        return _sum(account.lost(now - self._patience) for account in self._present())
+        before = now - self._patience
+        if self._lost is None or before >= self._lost_until:  # asked for in every turn
+            self._lost = _sum(account.lost(before) for account in self._present())
+            heard = (each.dated[0][0] for each in self._present() if each.dated)
+            self._lost_until = min(heard, default=float('inf'))
+        return self._lost
 
     def owing(self) -> list[str]:
         """Full names of the nodes of which something has not arrived."""

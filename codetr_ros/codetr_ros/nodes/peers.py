@@ -91,6 +91,8 @@ class Peers:
     by_instance: dict[str, Peer] = field(default_factory=dict)
     joiners: Collection[str] = ()
     joins: bool = False
+    _commands: dict[str, str] = field(default_factory=dict, init=False)  # by role
+    _newest: list[Peer] | None = field(default=None, init=False)  # None: somebody was heard since
 
     def note(self, presence: Presence, now: float) -> str | None:
         """Note a peer's presence; returns what is new about it, for the log."""
@@ -99,6 +101,7 @@ class Peers:
             return None  # an earlier one, which the last one has overtaken
         served = bool(presence.settings_hash) or (known is not None and known.served)
         self.by_instance[presence.instance_id] = Peer(presence, now, served)
+        self._newest = None
         who = f'{presence.role} {presence.node}'
         if known is None:
             before = [p for p in self.by_instance.values() if p.presence.node == presence.node]
@@ -122,12 +125,15 @@ class Peers:
         """The newest instance of each node. A killed instance publishes no last presence, and
         does not count once another has taken its place.
         """
+        if self._newest is not None:  # asked for several times in each turn
+            return self._newest
         newest: dict[str, Peer] = {}
         for peer in self.by_instance.values():
             old = newest.get(peer.presence.node)
             if old is None or peer.received_at >= old.received_at:
                 newest[peer.presence.node] = peer
-        return list(newest.values())
+        self._newest = list(newest.values())
+        return self._newest
 
     def alive(self, role: str) -> list[Peer]:
         """Peers of a role, the newest instance of each node."""
@@ -156,7 +162,9 @@ class Peers:
             ]:
                 missing.append(f'{role}{of} ({"; ".join(given_up)})')
             else:
-                start = roles.command(role)
+                start = self._commands.get(role) or roles.command(role)
+                self._commands[role] = start  # looked for on the disk
+
                 missing.append(f'{role}{of} (start it with `{start}` in this namespace)')
         return missing
 
@@ -217,6 +225,11 @@ class Peers:
             and peer.presence.instance_id != presence.instance_id
             for peer in self.by_instance.values()
         )
+
+    def recorded(self) -> bool:
+        """Whether the recorder has finished as it should: every phase is committed."""
+        there = [peer.presence for peer in self.alive('record')]
+        return any(each.finished and each.settings_hash for each in there)
 
     def waits_for_nobody(self, role: str, now: float, deadline: float) -> bool:
         """Whether all nodes of a role have finished, or been silent beyond a deadline.

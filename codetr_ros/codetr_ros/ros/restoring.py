@@ -1,5 +1,7 @@
 """A node that joins a run which has begun asks the recorder for what it needs, and waits."""
 
+from collections.abc import Callable
+
 from codetr_ros.nodes.asking import SERVICE
 from codetr_ros.nodes.restoring import Restoring, Returning, Steps
 from codetr_ros.ros.fetch import Asker
@@ -22,8 +24,19 @@ def returning(member: Membership, joined: Joined) -> Returning:
     )
 
 
-def ask_recorder(member: Membership, joined: Joined, steps: Steps) -> bool:
+def ask_recorder(
+    member: Membership,
+    joined: Joined,
+    steps: Steps,
+    over: Callable[[], bool] = lambda: False,
+) -> bool:
     """Ask the recorder one question after the other, and wait for each answer.
+
+    Args:
+        member: asks.
+        joined: the run.
+        steps: the questions.
+        over: whether nothing needs to be answered any more.
 
     Returns:
         False if asked to stop meanwhile.
@@ -36,4 +49,8 @@ def ask_recorder(member: Membership, joined: Joined, steps: Steps) -> bool:
     """
     recorder = Asker(member.link, SERVICE, joined.run.run_id)
     asking = Restoring(recorder, member.traffic.fetched, member.link.full_name, steps)
-    return not asking.lacking() or wait_for(member, asking.lacking, member.peers.cause)
+
+    def lacking() -> list[str]:
+        return [] if over() else asking.lacking()
+
+    return not lacking() or wait_for(member, lacking, member.peers.cause)

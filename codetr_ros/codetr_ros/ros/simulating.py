@@ -23,11 +23,15 @@ class Simulating(Wiring):
 
     def waits(self) -> str:
         """What the simulator waits for, in words. If it was left out meanwhile, it goes on where
-        the run stands.
+        the run stands, or has finished if the run has.
         """
         member, joined = self.member, self.joined
-        if self._behind.asks:
-            ask_recorder(member, joined, newest_committed(self._behind.answered))
-        if self._core.displaced:
-            ask_recorder(member, joined, take_place(returning(member, joined)))
+        if not self._over() and self._behind.asks:
+            asked = newest_committed(self._behind.answered)
+            ask_recorder(member, joined, asked, self._over)
+        if not self._core.finished and self._core.displaced:
+            ask_recorder(member, joined, take_place(returning(member, joined)), self._over)
         return super().waits()
+
+    def _over(self) -> bool:
+        return self._behind.over(self.member.peers)

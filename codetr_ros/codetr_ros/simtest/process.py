@@ -292,13 +292,18 @@ class Process:
 
     def waits(self) -> str:
         """What the node waits for, in words. A simulator that was left out goes on where the run
-        stands.
+        stands, or has finished if the run has.
         """
-        if self._behind is not None and self._behind.asks:
+        if self._over():
+            pass
+        elif self._behind is not None and self._behind.asks:
             self._restore(newest_committed(self._behind.answered))
         elif isinstance(self.core, Simulator) and self.core.displaced:
             self._restore(take_place(self._returning()))
         return f'waits for {self.core.waiting_for()}'
+
+    def _over(self) -> bool:
+        return self._behind is not None and self._behind.over(self.peers)
 
     def held(self) -> None:
         """Note that the process was held, and has read nothing for a while."""
@@ -346,7 +351,7 @@ class Process:
     def _restored(self) -> bool:
         """Whether all that was asked of the recorder has come."""
         if self._restoring is not None:
-            if self._lacks(self._restoring.lacking()):
+            if not self._over() and self._lacks(self._restoring.lacking()):
                 return False
             self._restoring = None
             self.traffic.release(self._later)
