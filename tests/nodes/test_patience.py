@@ -173,3 +173,20 @@ def test_all_environments_of_a_simulator_must_be_left_out():
     (peer,) = peers.newest()
     assert not peer.left_out(settings, ['sim_2-1'])
     assert peer.left_out(settings, ['sim_2-1', 'sim_2-2'])
+
+
+def test_a_simulator_that_is_held_when_all_is_recorded_is_waited_for_no_longer_than_the_deadline():
+    peers = Peers('record')
+    peers.note(presence('sim', doing='waits for permission'), 140.0)
+    peers.note(presence('learner', finished=True, doing='has finished'), 141.0)
+    recorded = Settling('/r/record', peers, Limit(DEADLINE), recorded=lambda peer: True)
+    assert recorded.check({}, 59.0, 199.0)[0] is False
+    assert recorded.check({}, 61.0, 201.0) == (True, 'has finished')
+    assert recorded.without == ['sim /r/sim']
+    with pytest.raises(NodeError, match='1 of true_rewards. The bag lacks that'):
+        recorded.check({'true_rewards': 1}, 61.0, 201.0)
+    unknown = Settling('/r/record', peers, Limit(DEADLINE))
+    with pytest.raises(NodeError, match='waits for the end of sim /r/sim'):
+        unknown.check({}, 61.0, 201.0)
+    forever = Settling('/r/record', peers, Limit(0.0), recorded=lambda peer: True)
+    assert forever.check({}, 1000.0, 2000.0)[0] is False

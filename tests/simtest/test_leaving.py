@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from codetr_ros.simtest.plan import DEADLINE
 from codetr_ros.simtest.run import carry_out
 from helpers.leaving import FOUR, TWO, leaving
 
@@ -53,3 +54,17 @@ def test_a_simulator_that_is_there_again_when_the_run_is_over_catches_up_and_end
     assert ended.failures == []
     assert ended.errors == {}
     assert happened(ended, 'sim_2 is left out') == 1
+
+
+def test_a_run_ends_well_without_its_simulator_that_is_held_once_all_is_recorded():
+    def single(stalls):
+        planned = leaving(TWO, stalls)
+        return replace(planned, settings=planned.settings.changed({'simulators': 1, 'steps': 24}))
+
+    last = f'publishes Commit(phase={single({}).settings.phases - 1})'
+    undisturbed = carry_out(single({}), kept=10_000)
+    (at,) = [float(line.split()[0]) for line in undisturbed.trace if last in line]
+    ended = carry_out(single({'sim': [(at, 3 * DEADLINE)]}), kept=10_000)
+    assert ended.failures == []
+    assert ended.errors == {}
+    assert happened(ended, 'ends without sim') == 1

@@ -133,7 +133,7 @@ def run(
                     lambda node: why_it_gave_up(node, folder),
                     restarts=topics.restarts,
                     over=lambda node: is_over(node, folder),
-                    dispensable=lambda node: _can_do_without(node, summary),
+                    dispensable=lambda node: _can_do_without(node, summary, folder),
                 )
                 watching.poll(0.0)  # the last messages of the last node
         except LaunchError as error:
@@ -156,9 +156,12 @@ def run(
     return Outcome(reports, interrupted, failure, culprit)
 
 
-def _can_do_without(node: launcher.Node, summary: Summary) -> bool:
+def _can_do_without(node: launcher.Node, summary: Summary, folder: Path) -> bool:
     """Whether a run goes on without a node that has failed for good. Nobody begins before all are
-    there: one that fails with a reason before the first commit has none to wait for.
+    there: one that fails with a reason before the first commit has none to wait for. A simulator
+    without which the recorder has finished is not needed any more.
     """
+    if node.role == 'sim' and node.code is None:
+        return node_reports.has_finished(folder, 'record')
     begun = summary.phases > 0 or may_be_started_again(node.code) or node.code is None
     return begun and TABLE[node.role].dispensable

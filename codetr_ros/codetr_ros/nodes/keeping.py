@@ -27,6 +27,7 @@ from codetr_ros.nodes.traffic import Traffic
 from codetr_ros.records import (
     TOPICS,
     Commit,
+    Metrics,
     Policy,
     Record,
     RecordError,
@@ -100,7 +101,10 @@ class Keeping:
         self._core, self._bag, self._traffic = keeper.core, keeper.bag, keeper.traffic
         self._log = keeper.log
         self._silence = Silence(keeper.peers, keeper.settings, keeper.leave_out_after)
-        self._settling = Settling(keeper.who, keeper.peers, keeper.limit, self._gone)
+        self._settling = Settling(
+            keeper.who, keeper.peers, keeper.limit, self._gone, self._has_all_of
+        )
+        self._done: set[str] = set()  # simulators whose last record is there
         self._beside = Beside(keeper.run, keeper.settings, lambda: keeper.core.phase)
         self._unannounced = Early(keeper.settings)
         self._catches_up_until = 0.0  # [s, monotonic]
@@ -127,6 +131,7 @@ class Keeping:
         """
         if isinstance(record, TaskSpec):
             self._unannounced.announced(record.source)
+        self._note_done(record)
         try:
             self._core.restore(record)
             if type(record) not in self._core.subscribes:
@@ -246,6 +251,7 @@ class Keeping:
         """
         if isinstance(record, Commit):
             self._beside.receive(record)
+        self._note_done(record)
         self._bag.write(record, raw, self._by.stamp(), published)
 
     # ---- what is lacking
@@ -306,6 +312,20 @@ class Keeping:
                 'phase are dropped; it joins again with a later one'
             )
 
+    def _has_all_of(self, peer: Peer) -> bool:
+        """Whether all that a simulator has to publish is there."""
+        return peer.presence.role == 'sim' and peer.name in self._done
+
+    def _note_done(self, record: Record) -> None:
+        """Note which simulators are done: their metrics of the last phase are the last of all. A
+        robot may publish scores behind them.
+        """
+        settings = self._by.settings
+        if settings.on_robot or not isinstance(record, Metrics):
+            return
+        if (record.role, record.phase) == ('sim', settings.phases - 1):
+            self._done.add(record.node)
+
     def _gone(self, peer: Peer, now: float) -> bool:
         """Whether a node is silent and all that it simulates is left out: nobody waits for it."""
         self._silence.sources(now)
@@ -342,9 +362,16 @@ class Keeping:
         elif self._sweeper.busy and now < self._missed_until:
             self._sweeper.check()
             return False, 'waits for what others have published while it was away'
-        elif self.without:
+        held = self._settling.held
+        lacking = [who for who in self.without if who not in held]
+        if settled and lacking:
             self._log.warning(
-                f'ends without {", ".join(self.without)}: what was still to come from there is '
+                f'ends without {", ".join(lacking)}: what was still to come from there is '
                 'not in the bag'
+            )
+        if settled and held:
+            self._log.warning(
+                f'ends without {", ".join(held)}, from which nothing has come for longer than '
+                'peer_deadline: all that it had to publish is in the bag'
             )
         return settled, doing

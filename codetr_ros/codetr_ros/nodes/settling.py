@@ -13,12 +13,15 @@ class Settling:
     Attributes:
         without: roles and names of the nodes without which it ends: the run needs nothing of
             them.
+        held: those of them that are silent, and of which nothing is lacking.
 
     Args:
         who: the recorder's full name.
         peers: the other nodes.
         limit: how long it waits for silent ones.
         left_out: whether nobody waits for a node any more, at a monotonic time [s].
+        recorded: whether everything that a node has to publish is recorded, as far as that can be
+            known: it may then be silent for good.
     """
 
     def __init__(
@@ -27,12 +30,15 @@ class Settling:
         peers: Peers,
         limit: Limit,
         left_out: Callable[[Peer, float], bool] = lambda peer, now: False,
+        recorded: Callable[[Peer], bool] = lambda peer: False,
     ) -> None:
         self._who = who
         self._peers = peers
         self._deadline = limit.seconds
         self._left_out = left_out
+        self._recorded = recorded
         self.without: list[str] = []
+        self.held: list[str] = []
 
     def gone(self, now: float) -> list[Peer]:
         """The nodes that nobody waits for, and of which nothing is still to come.
@@ -60,6 +66,10 @@ class Settling:
         """
         grace = max(GRACE, self._deadline)
         gone = self.gone(now)
+        held = self._silent_for_good(now)
+        self.held = [peer.who for peer in held]
+        self.without += self.held
+        gone += held
         awaited = [p for p in self._peers.newest() if p not in gone]
         there = [
             p
@@ -88,3 +98,14 @@ class Settling:
                 self._peers.cause(),
             )
         return False, doing
+
+    def _silent_for_good(self, now: float) -> list[Peer]:
+        """Nodes that are silent beyond the deadline, and of which nothing is to come any more."""
+        return [
+            peer
+            for peer in self._peers.newest()
+            if not peer.presence.finished
+            and not peer.failed
+            and 0 < self._deadline < now - peer.received_at
+            and self._recorded(peer)
+        ]
