@@ -4,10 +4,13 @@ import logging
 from dataclasses import replace
 
 from codetr_ros.bags.definitions import encode
+from codetr_ros.config import settled
+from codetr_ros.cores import in_process
 from codetr_ros.cores.labeller import Labeller
+from codetr_ros.cores.learner import Learner
 from codetr_ros.nodes.traffic import Traffic
 from codetr_ros.records import Transitions
-from helpers.builders import score, tiny, transitions
+from helpers.builders import score, step_rewards, tiny, transitions
 
 
 def test_what_is_of_another_run_does_not_stand_in_for_what_is_lost_of_this_one():
@@ -33,3 +36,19 @@ def test_what_a_node_fetches_again_once_it_has_joined_was_not_taken_before():
         traffic.receive_again(record)
     assert core.duplicated == {}
     assert traffic.recovered == {'transitions': 1, 'composite_rewards': 1}
+
+
+def test_labels_of_phases_that_a_learner_goes_on_behind_are_taken(tmp_path):
+    """It has their checkpoint already, and takes in the phases before from the first on."""
+    settings = settled(tiny(method='none', evaluate_every=0, sac__updates_per_step=0.01))
+    in_process.run(settings, 'run', tmp_path)
+    traffic = Traffic(logging.getLogger(__name__))
+    core = Learner(settings.run_spec('run'), settings, 'learner', tmp_path / 'checkpoints')
+    traffic.core, traffic.settings = core, settings
+    phase = core.resume(settings.phases - 2)
+    for of in (phase, phase + 1):
+        assert traffic.receive(step_rewards(phase=of))
+    assert not traffic.refused
+    assert core.due == 0
+    traffic.receive(step_rewards(phase=phase + settings.lag + 1))
+    assert traffic.refused == {'step_rewards': 1}

@@ -252,6 +252,9 @@ class Traffic:
             return False
         # so many commits reach a node that was started again and takes in earlier phases
         late = LATE_COMMITS if isinstance(record, Commit) else 0
+        if (permitted := self.core.permitted) is not None:
+            # it goes on from a checkpoint, and takes the phases up to that in once more
+            due = max(due, permitted - settings.ahead)
         try:
             check_phase(record, due + late, settings)
         except RecordError as error:
