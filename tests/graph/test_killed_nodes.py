@@ -23,7 +23,11 @@ def undisturbed(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('roles', [('learner', 'sim'), ('record', 'reward')])
+@pytest.mark.parametrize(
+    'roles',
+    [('learner', 'sim'), ('record', 'reward'), ('learner', 'record', 'reward', 'sim')],
+    ids='-'.join,
+)
 def test_nodes_killed_at_once_join_again_and_the_weights_are_the_same(
     tmp_path, undisturbed, roles
 ):
@@ -41,3 +45,6 @@ def test_nodes_killed_at_once_join_again_and_the_weights_are_the_same(
     again = {use['role']: use['restarts'] for use in summary['processes'].values()}
     assert {role for role, times in again.items() if times} == set(roles)
     assert all(f'{role} was ended by SIGKILL: starting it again' in said for role in roles)
+    for log in (folder / 'logs').glob('*.log'):
+        errors = [line for line in log.read_text().splitlines() if '[ERROR]' in line]
+        assert errors == [], log.stem

@@ -1,4 +1,4 @@
-"""A node asks for the policy that it waits for: the learner, or the recorder for an old one."""
+"""A node asks for what it lacks: the learner or, for what is old, the recorder."""
 
 from dataclasses import dataclass, field
 
@@ -13,8 +13,8 @@ from codetr_ros.nodes.asking import SERVICE, Answer
 from codetr_ros.nodes.catching_up import Fetcher
 from codetr_ros.nodes.fetching import AFTER, AGAIN
 from codetr_ros.nodes.peers import Peers
-from codetr_ros.records import INITIAL_VERSION, Policy, Presence
-from helpers.builders import policy, tiny
+from codetr_ros.records import INITIAL_VERSION, Commit, Policy, Presence
+from helpers.builders import commit, policy, tiny
 
 LEARNER = Presence(
     run_id='run',
@@ -47,7 +47,7 @@ class Asked:
     busy: bool = False
 
     def ask(self, phase, answered, kinds=()):
-        assert kinds == ['codetr_msgs/msg/Policy']
+        assert kinds in (['codetr_msgs/msg/Policy'], ['codetr_msgs/msg/Commit'])
         self.questions.append(phase)
         answered(self.answer)
 
@@ -75,6 +75,8 @@ def fetcher():
 class Log:
     def warning(self, message):
         pass
+
+    info = warning
 
 
 def sent():
@@ -127,3 +129,40 @@ def test_an_evaluator_waits_for_the_policy_with_the_next_version_to_be_evaluated
     core.receive(policy(phase=0, random=True, network='', weights=b''))
     assert core.unpermitted == phases[1]
     core.close()
+
+
+class Behind(Part):
+    """A core that takes phases in, of which it has the first five."""
+
+    subscribes = (Commit,)
+    missing: int | None = 5
+    due = 5
+    permitted = 7
+    committed: int | None = None
+
+    def catch_up(self, newest):
+        self.committed = newest
+
+
+@pytest.mark.parametrize('gone_by', [(), (5,), (6,)])
+def test_a_phase_whose_commit_came_too_early_is_asked_for_at_once(fetcher, gone_by):
+    """Else a node that is one commit behind stays so: the next comes too early as well."""
+    made, asked, _, now = fetcher
+    core = Behind()
+    core.gone_by = gone_by
+    asked[SERVICE].answer = Answer(5)
+    made.check(core)
+    assert asked[SERVICE].questions == ([5] if 5 in gone_by else [])
+    now[0] = AFTER
+    made.check(core)
+    assert asked[SERVICE].questions == [5]
+
+
+@pytest.mark.parametrize(('phase', 'behind'), [(4, 5), (6, 6), (7, 7), (8, 5)])
+def test_a_commit_that_is_set_aside_is_one_more_that_the_node_is_behind(fetcher, phase, behind):
+    made, *_ = fetcher
+    core = Behind()
+    made.behind = 5
+    assert made.later(commit(phase=phase), core)
+    assert made.behind == behind
+    assert core.committed == (phase if phase in (6, 7) else None)

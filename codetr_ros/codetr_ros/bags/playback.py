@@ -192,6 +192,7 @@ class Playback:
     missing = unlabelled = uncommitted = unpermitted = None  # it takes no phases in
     unannounced = False
     left_out: frozenset[str] = frozenset()
+    gone_by: Collection[int] = ()
     due = permitted = None
 
     def __init__(

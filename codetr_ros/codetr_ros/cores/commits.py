@@ -30,6 +30,9 @@ class Commits:
         absent: those of them that are permitted nothing, by the commits that were taken.
         permitted: returns the newest phase that can have been permitted.
         refused: counts refusals that come later than `receive`, by topic.
+
+    Attributes:
+        missed: phases of commits that came before their turn, and went.
     """
 
     def __init__(
@@ -47,7 +50,7 @@ class Commits:
         self._refused = refused
         self._held: dict[int, dict[str, Commit]] = {}  # by phase and digest
         self._digests: list[str] = []  # of the commits that were taken, by phase
-        self._missed: set[int] = set()  # phases of commits that came before their turn
+        self.missed: set[int] = set()
 
     @property
     def next(self) -> int:
@@ -58,7 +61,7 @@ class Commits:
     def lacking(self) -> int | None:
         """The phase whose commit is lacking though a later one has come; None if none is."""
         newest = self._permitted()
-        missed = any(self.next <= phase <= newest for phase in self._missed)
+        missed = any(self.next <= phase <= newest for phase in self.missed)
         return self.next if missed and not self.of(self.next) else None
 
     def digest(self, phase: int) -> str:
@@ -87,7 +90,7 @@ class Commits:
         held = self.of(commit.phase)
         if len(held) == MOST_HELD:  # of a flood, the newest stay: what is fetched is the newest
             self.refuse(held[0], 'is one of too many that contradict each other')
-            self._missed.add(commit.phase)
+            self.missed.add(commit.phase)
         self._held.setdefault(commit.phase, {})[own] = commit
         return True
 
@@ -101,7 +104,7 @@ class Commits:
         newest = min(self._permitted(), self._settings.phases - 1)
         if commit.phase > newest:
             if commit.phase < self._settings.phases:
-                self._missed.add(commit.phase)
+                self.missed.add(commit.phase)
             return (
                 f'is of phase {commit.phase}, and phase {newest} is the newest that can have been '
                 'permitted: stop what publishes it'
@@ -121,7 +124,7 @@ class Commits:
         if commit.previous in before:
             return ''
         if not before:
-            self._missed.add(commit.phase)
+            self.missed.add(commit.phase)
             return f'comes before that of phase {commit.phase - 1}, which is asked for'
         return (
             f'follows on the commit {commit.previous!r}, that of phase {commit.phase - 1} is '
@@ -169,5 +172,5 @@ class Commits:
             if digest(other) != own:
                 self.refuse(other, 'is not the one whose digests the records have')
         self._held.pop(commit.phase, None)
-        self._missed.discard(commit.phase)
+        self.missed.discard(commit.phase)
         self._digests.append(own)

@@ -73,6 +73,7 @@ class Consumer(Part, ABC):
         self._from: Checkpoint | None = None  # where to go on
         self._last_metrics: dict[str, float] = {}  # as published after the last phase
         self._counters: Counter[str] = Counter()
+        self.gone_by = self._intake.commits.missed
         self.duplicated = self._intake.duplicated
         self.refused = self._intake.refused
 

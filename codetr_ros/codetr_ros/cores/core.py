@@ -1,7 +1,7 @@
 """The interface of every part of a run, over topics or in process."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Protocol, TypeVar
 
 from codetr_ros.records import Record
@@ -27,6 +27,10 @@ class Core(Protocol[Given_co]):
     @property
     def missing(self) -> int | None:
         """A committed phase that is incomplete; None if there is none."""
+
+    @property
+    def gone_by(self) -> Collection[int]:
+        """Phases whose commits came before their turn, and went: they are not under way."""
 
     @property
     def uncommitted(self) -> int | None:
@@ -93,6 +97,7 @@ class Part:
     """The defaults of most cores: nothing is missing or counted, and any message is awaited."""
 
     finished = False
+    gone_by: Collection[int] = ()
 
     def __init__(self) -> None:
         self.duplicated: Counter[str] = Counter()

@@ -85,13 +85,18 @@ class Fetcher:
             return False
         if isinstance(record, StepRewards):  # made again now, for one phase after the other
             return record.phase > permitted
+        if isinstance(record, Commit) and self.behind < record.phase <= permitted:
+            self.behind = record.phase  # it will not come again by itself
+            consumer: Any = core
+            consumer.catch_up(record.phase)
         return isinstance(record, OF_PHASES)
 
     def check(self, core: Core[Any]) -> None:
         """Ask for what the core has lacked for a while."""
         now = self._clock()
         missing, unlabelled = core.missing, core.unlabelled
-        if self._phases.due(missing, now, missing is not None and missing <= self.behind):
+        known = missing is not None and (missing <= self.behind or missing in core.gone_by)
+        if self._phases.due(missing, now, known):
             assert missing is not None
             self._kinds, self._fetched = core.subscribes, core.fetched
             self._ask_recorder(missing)
