@@ -1,11 +1,14 @@
 """Does method `evidence` name the kind of score that nobody states? Blind trials.
 
     .venv/bin/python benchmarks/naming.py --trials 200 --out benchmarks/results/naming.csv
+    .venv/bin/python benchmarks/naming.py --trials 158 --tasks Hopper-v5 --terminal-feature \
+        --out benchmarks/results/naming_ends.csv
 
 Each trial draws a task, a kind of score (sum, sum_square, square_sum, max, minimum), an inverse
 temperature between 1 and 6 in units of one by the deviation of step rewards, a delay and a number
 of scores, and lets `evidence.link: choose` infer the kind from the scores of segments of a
-true-reward run (`reward_recovery.py`). `square_sum` and the like are named from the scores alone.
+true-reward run (`reward_recovery.py`). `--terminal-feature` repeats trials with the setting
+`evidence.terminal_feature`. `square_sum` and the like are named from the scores alone.
 
     named, probability, margin   what it takes it for, how likely, and by how many nats it leads
     beta_ratio                   inferred inverse temperature by the true one, of max and minimum
@@ -55,7 +58,7 @@ COLUMNS = (
 
 
 def drawn(number: int, data: dict[str, dict[str, np.ndarray]]) -> tuple[Settings, int]:
-    """The settings of a trial, and how many scores it has; `data` may lack other tasks."""
+    """The settings of a trial, and how many scores it has."""
     rng = generator(0, 'naming', number)
     task = str(rng.choice(TASKS))
     kind = str(rng.choice(KINDS))
@@ -68,9 +71,10 @@ def drawn(number: int, data: dict[str, dict[str, np.ndarray]]) -> tuple[Settings
     return settings, scores
 
 
-def trial(number: int, data: dict[str, dict[str, np.ndarray]]) -> list[object]:
+def trial(
+    number: int, settings: Settings, scores: int, data: dict[str, dict[str, np.ndarray]]
+) -> list[object]:
     """A row of the table."""
-    settings, scores = drawn(number, data)
     task, kind, beta, delay = settings.task, settings.composite, settings.beta, settings.delay
     steps = data[task]
     train, held_out = reward_recovery.memories(steps, settings, None, scores)
@@ -134,6 +138,8 @@ def main() -> None:
     parser.add_argument('--out', type=Path, default=Path('benchmarks/results/naming.csv'))
     parser.add_argument('--cache', type=Path, default=Path('.venv/cache'))
     parser.add_argument('--trials', type=int, default=200)
+    parser.add_argument('--tasks', nargs='+', choices=TASKS, default=TASKS)
+    parser.add_argument('--terminal-feature', action='store_true')
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     commit = machine.commit()
@@ -143,8 +149,10 @@ def main() -> None:
     }
     rows = Rows(arguments.out, COLUMNS, keys=1)
     for number in range(arguments.trials):
-        if (number,) not in rows:
-            rows.append([*trial(number, data), commit])
+        settings, scores = drawn(number, data)
+        if (number,) not in rows and settings.task in arguments.tasks:
+            ends = {'evidence.terminal_feature': arguments.terminal_feature}
+            rows.append([*trial(number, settings.changed(ends), scores, data), commit])
     write_table(arguments.out)
 
 

@@ -291,6 +291,12 @@ class EvidenceSettings(Group):
         'only the order means anything: their scale is then learnt too; auto: ordinal where '
         '`score_levels` are set, and where others than the simulator give few different scores',
     )
+    terminal_feature: bool = Field(
+        False,
+        description='steps that led to a terminal state have a feature of their own: rewards '
+        'often jump there, as where a robot falls. It helps `link: choose` to name the kind of '
+        'score',
+    )
     caution: float = Field(
         1.0,
         ge=0,

@@ -29,10 +29,11 @@ class SegmentBatch:
     context: I64  # (B,) leading steps that precede the segment
     values: F64  # (B,) the segment's composite reward; NaN: none, or only a window to be labelled
     true_rewards: F32 | None = None  # (B, L) if the memory holds them, for the oracle only
+    terminated: NDArray[np.bool_] | None = None  # (B,) the last step led to a terminal state
 
     def part(self, rows: slice) -> 'SegmentBatch':
         """Some of the segments, in views of the same arrays."""
-        rewards = self.true_rewards
+        rewards, ends = self.true_rewards, self.terminated
         return SegmentBatch(
             self.observations[rows],
             self.actions[rows],
@@ -40,4 +41,5 @@ class SegmentBatch:
             self.context[rows],
             self.values[rows],
             None if rewards is None else rewards[rows],
+            None if ends is None else ends[rows],
         )

@@ -345,12 +345,15 @@ class Segments:
         observations = np.empty((size, steps + 1, self._store.observation_size), np.float32)
         actions = np.empty((size, steps, self._store.action_size), np.float32)
         rewards = np.empty((size, steps), np.float32) if self._store.true_rewards else None
+        terminated = np.empty(size, np.bool_)
         for _, source, mine, _ in self._by_source(ids):
             parts = source.windows(rows[mine], lengths[mine], steps)
             observations[mine], actions[mine] = parts[:2]
             if rewards is not None:
                 rewards[mine] = parts[2]
-        return SegmentBatch(observations, actions, lengths, context, values, rewards)
+            ends = rows[mine] + lengths[mine] - 1
+            terminated[mine] = source.terminated[ends % source.capacity]
+        return SegmentBatch(observations, actions, lengths, context, values, rewards, terminated)
 
 
 def segment_ids(source: int, numbers: I64) -> I64:

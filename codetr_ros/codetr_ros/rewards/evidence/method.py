@@ -31,7 +31,7 @@ from codetr_ros.records import F32, F64, I64
 from codetr_ros.rewards.base import ModelFacts, Predictor, RewardModelError, segment_steps
 from codetr_ros.rewards.evidence import links, saving
 from codetr_ros.rewards.evidence.choice import choose
-from codetr_ros.rewards.evidence.features import PIECE, Features, step_inputs
+from codetr_ros.rewards.evidence.features import PIECE, Features, ends_of, step_inputs
 from codetr_ros.rewards.evidence.link import Link
 from codetr_ros.rewards.evidence.maxima import SoftMax
 from codetr_ros.rewards.evidence.model import Model, of_steps
@@ -71,7 +71,9 @@ class Evidence(Predictor):
     def __init__(self, settings: Settings, observation_size: int, action_size: int) -> None:
         super().__init__(settings, observation_size, action_size)
         self._own = settings.evidence
-        self._features = Features(observation_size, action_size, settings.seed)
+        self._features = Features(
+            observation_size, action_size, settings.seed, self._own.terminal_feature
+        )
         self._sampler = Sampler(self._features)
         self._model = self._new_model()
         self._second: Model | None = None  # of the link that is nearly as likely
@@ -268,7 +270,7 @@ class Evidence(Predictor):
 
     def _doubt_beyond_usual(self, batch: SegmentBatch, steps: NDArray[np.bool_]) -> F64:
         """How much less sure (N,) the likelier link is of steps than of the newest scored ones."""
-        features = (self._features(piece) for piece in _steps(batch, steps))
+        features = (self._features(piece) for piece in self._inputs(batch, steps))
         found = step_deviations(self._model, features) * (self._model.scale / self.unit)
         return found - self._step_sd
 
@@ -294,7 +296,7 @@ class Evidence(Predictor):
         """
         self._require_prepared()
         inside = segment_steps(batch)
-        features = [self._features(piece) for piece in _steps(batch, inside)]
+        features = [self._features(piece) for piece in self._inputs(batch, inside)]
         found = deviations(self._model, features, batch.lengths - batch.context)
         factor = self._model.scale / self.unit
         steps = np.zeros(inside.shape, np.float32)
@@ -308,7 +310,7 @@ class Evidence(Predictor):
         """
         self._require_prepared()
         model, m = self._model, batch.lengths - batch.context
-        features = [self._features(piece) for piece in _steps(batch, segment_steps(batch))]
+        features = [self._features(piece) for piece in self._inputs(batch, segment_steps(batch))]
         found = levels(model, features, m)
         revealed = found.covariance * (model.scale / self.unit) ** 2
         if model.verdicts is None:
@@ -337,8 +339,16 @@ class Evidence(Predictor):
     def _f(self, batch: SegmentBatch, model: Model) -> F64:
         """The posterior mean (N,) of segments' steps, in units of the level scale."""
         weights = model.posterior.mean
-        pieces = _steps(batch, segment_steps(batch))
+        pieces = self._inputs(batch, segment_steps(batch))
         return np.concatenate([of_steps(self._features(piece), weights) for piece in pieces])
+
+    def _inputs(self, batch: SegmentBatch, inside: NDArray[np.bool_]) -> Iterator[F32]:
+        """What features are made of, of the steps (N,) of segments, in pieces."""
+        before, after = batch.observations[:, :-1][inside], batch.observations[:, 1:][inside]
+        ends = ends_of(batch, inside) if self._features.ends else None
+        inputs = step_inputs(before, batch.actions[inside], after, ends)
+        for i in range(0, len(inputs), PIECE):
+            yield inputs[i : i + PIECE]
 
     def metrics(self) -> dict[str, float]:
         """How well the regression knows the scores, after each phase."""
@@ -432,11 +442,3 @@ class Evidence(Predictor):
         features.waves, features.phases = state['waves'].clone(), state['phases'].clone()
         features.mean, features.std = state['input_mean'].clone(), state['input_std'].clone()
         self._sampler.forget()
-
-
-def _steps(batch: SegmentBatch, inside: NDArray[np.bool_]) -> Iterator[F32]:
-    """The inputs (N, 2 O + A) of the steps of segments, in pieces."""
-    before, after = batch.observations[:, :-1][inside], batch.observations[:, 1:][inside]
-    inputs = step_inputs(before, batch.actions[inside], after)
-    for i in range(0, len(inputs), PIECE):
-        yield inputs[i : i + PIECE]

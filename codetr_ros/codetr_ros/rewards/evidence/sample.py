@@ -15,12 +15,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from codetr_ros.memory.batches import SegmentBatch
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import F32, F64, I64
 from codetr_ros.rewards.evidence.features import (
     PIECE,
     Features,
     Moments,
+    ends_of,
     moments,
     step_inputs,
     sums,
@@ -125,7 +127,7 @@ class Sampler:
     def moments(self, memory: Trajectories, ids: I64) -> Moments:
         """Moments of the steps of some segments."""
         self._attend(memory)
-        self._sums = _kept(self._sums, ids, lambda new: self._each(memory, new, sums))
+        self._sums = _kept(self._sums, ids, lambda new: self._each(memory, new, self._added))
         total = np.sum(list(self._sums.values()), 0)
         return moments(total, memory.observation_size, memory.action_size)
 
@@ -146,6 +148,9 @@ class Sampler:
         self._means = _kept(self._means, ids, lambda new: self._each(memory, new, self._mean))
         return Sample(scores, m, torch.stack(list(self._means.values())))
 
+    def _added(self, inputs: F32) -> F64:
+        return sums(inputs[:, : self._features.inputs])
+
     def _rows(self, inputs: F32) -> Tensor:
         return torch.cat([self._features(piece) for piece in _pieces(inputs)])
 
@@ -153,16 +158,24 @@ class Sampler:
         parts = [self._features(piece).sum(0, dtype=torch.float64) for piece in _pieces(inputs)]
         return torch.stack(parts).sum(0) / len(inputs)
 
-    @staticmethod
-    def _each(memory: Trajectories, ids: I64, look: Callable[[F32], V]) -> list[V]:
+    def _each(self, memory: Trajectories, ids: I64, look: Callable[[F32], V]) -> list[V]:
         """What there is to see of each segment."""
         views: list[V] = []
         for i in range(0, len(ids), GATHERED):
             batch = memory.segments.batch(ids[i : i + GATHERED])
             for row, m in enumerate(batch.lengths.tolist()):
-                states = batch.observations[row, : m + 1]
-                views.append(look(step_inputs(states[:-1], batch.actions[row, :m], states[1:])))
+                states, actions = batch.observations[row, : m + 1], batch.actions[row, :m]
+                ends = self._ends(batch, row, m)
+                views.append(look(step_inputs(states[:-1], actions, states[1:], ends)))
         return views
+
+    def _ends(self, batch: SegmentBatch, row: int, m: int) -> NDArray[np.bool_] | None:
+        """Which steps (m,) of a segment led to a terminal state, where features ask for it."""
+        if not self._features.ends:
+            return None
+        return ends_of(
+            batch.part(slice(row, row + 1)), np.arange(batch.actions.shape[1])[None] < m
+        )
 
 
 def gathered(steps: Tensor, slopes: F64, m: I64) -> Tensor:
