@@ -42,6 +42,7 @@ from codetr_ros.rewards.base import Predictor, segment_steps
 from codetr_ros.rewards.codetr import Codetr
 from codetr_ros.runs.recovery_metrics import r_squared, step_recovery
 from codetr_ros.seeding import generator, seed_torch
+from codetr_ros.simulation import tasks
 from codetr_ros.simulation.composite import composite
 
 COMPOSITES = ('sum', 'sum_square', 'square_sum', 'max')
@@ -169,7 +170,8 @@ def memories(
     for episode, final in enumerate(data['finals']):
         rows = np.flatnonzero(data['episodes'] == episode)
         side = int(episode % 5 == 4)
-        steps, true = _recorded(data, rows, final, counts[side])
+        fell = len(rows) < tasks.find(settings.task).horizon
+        steps, true = _recorded(data, rows, final, counts[side], fell)
         counts[side] += 1
         made[side].append(steps)
         made[side].append_true_rewards(true)
@@ -186,7 +188,7 @@ def memories(
 
 
 def _recorded(
-    data: dict[str, np.ndarray], rows: np.ndarray, final: np.ndarray, number: int
+    data: dict[str, np.ndarray], rows: np.ndarray, final: np.ndarray, number: int, fell: bool
 ) -> tuple[Transitions, TrueRewards]:
     """An episode: its steps, and their true rewards."""
     steps = Transitions(
@@ -199,8 +201,8 @@ def _recorded(
         steps=len(rows),
         observations=np.concatenate([data['observations'][rows], final[None]]),
         actions=data['actions'][rows],
-        terminated=False,
-        truncated=True,
+        terminated=fell,
+        truncated=not fell,
         phase_end=False,
         scores_due=0,
     )
