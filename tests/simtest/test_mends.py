@@ -384,7 +384,21 @@ def killed_at_the_end(planned):
 
 def lost_and_killed(planned):
     """A run in which what is lost is in no count, since nodes were killed just before."""
-    return plan(583)
+    weather = Weather(delay=0.3, reorder=True, lost=0.2, overrun=0.2, unanswered=0.1)
+    return replace(deadly(plan(13)), weather=weather)
+
+
+def killed_late(planned):
+    """A longer run whose learner and simulator are killed when nobody but the recorder keeps its
+    first phases any more.
+    """
+    planned = lossy(planned)
+    deaths = tuple(Death(name, 14.0 + planned.seed % 16, 1.0) for name in ('learner', 'sim'))
+    paces = dict.fromkeys(planned.paces, Pace(slice_seconds=0.2))
+    settings = planned.settings.changed({'steps': 96})
+    weather = Weather(delay=0.02)
+    planned = replace(planned, settings=settings, paces=paces, weather=weather)
+    return replace(planned, deaths=deaths, heals=True)
 
 
 def slow_and_lossy(planned):
@@ -413,7 +427,7 @@ PLANS = {
     count_what_was_late_twice: slow_and_lossy,
     leave_the_bag_of_a_killed_recorder_as_it_is: deadly,
     ask_nobody_what_a_killed_recorder_has_missed: deadly,
-    begin_from_the_start: deadly,
+    begin_from_the_start: killed_late,
     go_on_from_a_torn_checkpoint: deadly,
     forget_what_was_published: deadly,
     end_before_what_was_missed_is_there: killed_at_the_end,
