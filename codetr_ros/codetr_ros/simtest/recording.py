@@ -53,6 +53,7 @@ class Recording(Process):
     Attributes:
         disk: where its bag lies.
         bag: what it keeps.
+        opened: whether the bag could be opened.
 
     Args:
         place: where it is.
@@ -71,7 +72,7 @@ class Recording(Process):
         leave_out_after: float,
     ) -> None:
         super().__init__(place, core)
-        self.disk = disk
+        self.disk, self.opened = disk, False
         settings = place.settings
         names = {kind: f'/run/{TOPICS[kind]}' for kind in RECORDED}
         self.bag = _Bag(
@@ -112,6 +113,7 @@ class Recording(Process):
             BagError: it cannot be written.
         """
         self.bag.open(self.run.run_id, self._hold_already)
+        self.opened = True
         if not self.bag.recorded[TOPICS[RunSpec]]:
             self._write(self.run, self.message(self.run, self.stamp()))
         for commit in self._commits:
