@@ -4,9 +4,10 @@
 
 A small run over topics for each role. Once three phases are committed, the node of the role is
 held (SIGSTOP) for so many seconds: longer than the 20 s after which others take it for gone, so
-that all must find each other again. The digests of policy and reward model are compared with those
-of the same run in process. `logged` is what another node has logged of it meanwhile. A row for
-each role; one that is in the file is not made again.
+that all must find each other again. Where the default peer deadline of 60 s is too short, it is
+twice that time. The digests of policy and reward model are compared with those of the same run in
+process. `logged` is what another node has logged of it meanwhile. A row for each role; one that is
+in the file is not made again.
 """
 
 import argparse
@@ -26,21 +27,23 @@ from rows import Rows
 
 sys.path.insert(0, str(Path(__file__).parent.parent / 'tests'))
 from codetr_ros.bags.verify import verify
+from codetr_ros.cli.train_flags import PEER_DEADLINE
 from codetr_ros.cores import in_process
 from helpers.builders import tiny
 
 OUT = Path(__file__).parent / 'results' / 'stalls.csv'
 COLUMNS = ('role', 'held', 'exit_code', 'seconds', 'same', 'sound', 'lost', 'logged')
 SETTINGS = tiny(steps=2400)
-LONGEST = 300.0  # [s] for a run
+LONGEST = 300.0  # [s] for a run, beside the time for which a node is held
 
 
 def run(folder: Path, config: Path, role: str, held: float) -> tuple[int, float]:
     """Do a run in which a node is held; exit code and seconds."""
     began = time.monotonic()
+    deadline = ['--peer-deadline', f'{max(PEER_DEADLINE, 2 * held):g}']
     with folder.with_suffix('.log').open('w') as log:
         command = subprocess.Popen(
-            [CODETR, 'train', '--config', config, '--out', folder, '--no-film'],
+            [CODETR, 'train', '--config', config, '--out', folder, '--no-film', *deadline],
             stdout=log, stderr=subprocess.STDOUT,
         )  # fmt: skip
         while command.poll() is None and phase_of(folder) < 3:
@@ -50,7 +53,7 @@ def run(folder: Path, config: Path, role: str, held: float) -> tuple[int, float]
             os.kill(there, signal.SIGSTOP)
             time.sleep(held)
             os.kill(there, signal.SIGCONT)
-        while command.poll() is None and time.monotonic() - began < LONGEST:
+        while command.poll() is None and time.monotonic() - began < LONGEST + held:
             time.sleep(0.1)
         if command.poll() is None:
             command.send_signal(signal.SIGINT)

@@ -1,13 +1,13 @@
 """Does a run on two hosts, over a bad network, end as if nothing had happened?
 
-    .venv/bin/python benchmarks/two_hosts.py [--runs N]
+    .venv/bin/python benchmarks/two_hosts.py [--runs N] [--cut S]
 
 The simulator runs on one host, all other nodes on another. The hosts are namespaces of this
 machine: each has a network, process ids and a `/dev/shm` of its own. The cable between them loses,
-doubles, delays and reorders frames, as the seed draws it, and is cut for 30 seconds (longer than
-the middleware keeps silent peers, 20 s) with a phase under way. Small runs in lock-step and with
-overlap. The digests of policy and reward model are compared with those of the same run in process.
-A row for each run; one that is in the file is not made again.
+doubles, delays and reorders frames, as the seed draws it, and is cut with a phase under way, for
+30 seconds by default: longer than the middleware keeps silent peers, 20 s. Small runs in lock-step
+and with overlap. The digests of policy and reward model are compared with those of the same run in
+process. A row for each run; one that is in the file is not made again.
 """
 
 import argparse
@@ -35,7 +35,7 @@ COLUMNS = (
 KINDS = [(method, overlap) for method in ('codetr', 'rrd', 'none') for overlap in (False, True)]
 STEPS = 1600
 CUT_SECONDS = 30.0
-LONGEST = 400.0  # [s] for a run
+LONGEST = 400.0  # [s] for a run, beside the cut
 
 
 def weather(rng: random.Random) -> Weather:
@@ -45,13 +45,13 @@ def weather(rng: random.Random) -> Weather:
     )
 
 
-def run(folder: Path, method: str, overlap: bool, seed: int) -> list[object]:
+def run(folder: Path, method: str, overlap: bool, seed: int, cut: float) -> list[object]:
     """Do a run; what the row has of it."""
     rng = random.Random(seed)
     settings = tiny(method=method, overlap=overlap, steps=STEPS, evaluate_every=0)
     expected = in_process.run(settings, RUN_ID)
     cable, phase, began = weather(rng), rng.randrange(1, 5), time.monotonic()
-    shown = cable.lost, cable.doubled, f'{1000 * cable.delay:g}', CUT_SECONDS, phase
+    shown = cable.lost, cable.doubled, f'{1000 * cable.delay:g}', cut, phase
     with (
         domain(),
         Hosts(cable, seed) as both,
@@ -59,8 +59,8 @@ def run(folder: Path, method: str, overlap: bool, seed: int) -> list[object]:
     ):
         for name in nodes.names:
             nodes.start(name)
-        both.cut_amid_a_phase(nodes, phase, CUT_SECONDS)
-        while None in nodes.codes().values() and time.monotonic() - began < LONGEST:
+        both.cut_amid_a_phase(nodes, phase, cut)
+        while None in nodes.codes().values() and time.monotonic() - began < LONGEST + cut:
             time.sleep(0.5)
         codes = nodes.codes()
         frames = both.carried, both.lost
@@ -80,17 +80,21 @@ def main() -> int:
     """Make all rows that are lacking; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--runs', type=int, default=6, help='runs, all kinds in turn')
+    parser.add_argument('--first', type=int, default=0, help='number of the first run')
+    parser.add_argument('--cut', type=float, default=CUT_SECONDS, help='seconds of the cut')
     given = parser.parse_args()
     if why := hosts.why_not():
         print(f'two hosts cannot be made here: {why}', file=sys.stderr)
         return 2
     rows = Rows(OUT, COLUMNS, 3)
-    for number in range(given.runs):
+    for number in range(given.first, given.runs):
         kind = method, overlap = KINDS[number % len(KINDS)]
         if (*kind, number) in rows:
             continue
         with tempfile.TemporaryDirectory(prefix='codetr-hosts-') as place:
-            rows.append([*kind, number, *run(Path(place) / 'run', method, overlap, number)])
+            rows.append(
+                [*kind, number, *run(Path(place) / 'run', method, overlap, number, given.cut)]
+            )
     return 0
 
 
