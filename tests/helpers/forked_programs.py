@@ -38,8 +38,8 @@ def waits() -> None:
 
 
 def interrupted() -> None:
-    print(os.getpid())
     try:
+        print(os.getpid())
         time.sleep(600)
     except KeyboardInterrupt:
         print('interrupted')
