@@ -115,7 +115,7 @@ def test_the_command_names_a_checkpoint_that_is_not_that_of_the_bag(run, tmp_pat
         (tmp_path / name).write_bytes((folder / name).read_bytes())
     (tmp_path / 'bag').symlink_to(folder / 'bag')
     tensors, meta = checkpoints.load(folder / 'checkpoints' / 'learner-000003')
-    tensors['actor.mean.bias'] = tensors.get('actor.mean.bias', next(iter(tensors.values()))) + 1
+    tensors['actor.heads.weight'] = tensors['actor.heads.weight'] + 1
     checkpoints.save(tmp_path / 'checkpoints', 'learner', 3, tensors, meta)
     made = json.loads((tmp_path / 'run.json').read_text())
     made['versions']['torch'] = '1.0'

@@ -144,7 +144,7 @@ def test_a_damaged_policy_is_refused_by_name(tmp_path, capsys):
         'more than there is': ({'body': meta(observation_size=999_999)}, 'more than its tensors'),
         'of another task': ({'body': meta(observation_size=5)}, 'expected'),
         'not finite': (
-            {'tensors': lambda t: next(iter(t.values())).fill_(float('inf'))},
+            {'tensors': lambda t: t['actor.heads.weight'].fill_(float('inf'))},
             'not finite',
         ),
     }
