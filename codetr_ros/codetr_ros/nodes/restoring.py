@@ -173,15 +173,16 @@ def _has_begun(peers: Peers) -> bool:
 
 
 def _learner(node: Returning, newest: int) -> Steps:
-    # a bag that was restored from a copy may end earlier
-    _log_checkpoint(node, node.core.resume(newest))
+    # the permission for the phase behind `newest` followed from the phase `lag` before it, and a
+    # recorder that was killed too may have lost it: it is published once more
+    _log_checkpoint(node, node.core.resume(newest + 1 - node.settings.lag))
     node.catch_up(newest)
     yield from ()
 
 
 def _reward(node: Returning, newest: int) -> Steps:
-    # the learner, if it was killed too, goes on from the checkpoint before the phase that it was
-    # to learn from, or if that is damaged from the one before, and needs all labels since
+    # the learner, if it was killed too, may go on from the checkpoint of the phase
+    # `newest + 1 - lag`, or if that is damaged from the one before, and needs all labels since
     _log_checkpoint(node, node.core.resume(newest - node.settings.lag - 1))
     node.catch_up(newest)
     yield from ()
