@@ -12,8 +12,9 @@ pytestmark = pytest.mark.slow
 ROLES = ('learner', 'reward', 'record', 'robot')
 TICK = 0.01  # [s] of the simulation, every 4 ms of the machine: at most 2.5 times as fast
 RATE = 20.0
-PATIENCE = 1.5 / RATE
-"""Simulated seconds that the simulation goes on without a command: a machine may be busy."""
+PATIENCE = 1 / RATE
+"""Simulated seconds that the simulation goes on without a command: a machine may be busy. By then
+the next is due; a period later it would be missed."""
 
 
 @pytest.fixture(scope='module', autouse=True)
