@@ -1,5 +1,6 @@
 """Records made by hand, for tests: small, valid, and easy to make wrong in one field."""
 
+from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import Any
 
@@ -11,6 +12,7 @@ from codetr_ros.records import (
     Commit,
     CompositeReward,
     Policy,
+    Presence,
     RunSpec,
     ScoreRequest,
     StepRewards,
@@ -164,6 +166,25 @@ def policy(**changes: Any) -> Policy:
         ),
         **changes,
     )
+
+
+def presence(
+    role: str = 'sim', published: Mapping[str, int] | None = None, **changes: Any
+) -> Presence:
+    """A node of a role that takes part and has published so much, by topic."""
+    counts = published or {}
+    made = Presence(
+        run_id='run',
+        role=role,
+        node=f'/r/{role}',
+        instance_id=role,
+        settings_hash='hash',
+        finished=False,
+        topics=tuple(counts),
+        published=np.array(list(counts.values()), np.uint64),
+        missed=0,
+    )
+    return replace(made, **changes)
 
 
 def step_rewards(**changes: Any) -> StepRewards:

@@ -1,8 +1,5 @@
 """With a key, what is not signed, not of its role or not new is refused, whatever it contains."""
 
-from dataclasses import replace
-
-import numpy as np
 import pytest
 
 from codetr_ros.bags.definitions import decode, decode_sent, encode
@@ -19,6 +16,7 @@ from codetr_ros.records import (
     Transitions,
     metrics,
 )
+from helpers import builders
 from helpers.builders import commit, policy, run, same, score, task_spec, tiny, transitions
 
 KEY = bytes(range(32))
@@ -42,18 +40,7 @@ def traffic():
 
 
 def presence(role, sender, **changes):
-    made = Presence(
-        run_id='run',
-        role=role,
-        node=f'/r/{role}',
-        instance_id=sender,
-        settings_hash='',
-        finished=False,
-        topics=(),
-        published=np.zeros(0, np.uint64),
-        missed=0,
-    )
-    return replace(made, **changes)
+    return builders.presence(role, instance_id=sender, settings_hash='', **changes)
 
 
 def test_a_signed_message_is_the_record_and_names_its_sender():

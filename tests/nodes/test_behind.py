@@ -10,8 +10,7 @@ from codetr_ros.cores.simulator import Simulator
 from codetr_ros.nodes.behind import MOST, Behind
 from codetr_ros.nodes.peers import Peers
 from codetr_ros.nodes.traffic import Traffic
-from codetr_ros.records import Presence
-from helpers.builders import policy, run, tiny
+from helpers.builders import policy, presence, run, tiny
 
 BOTH = ('sim', 'sim_2')
 SETTINGS = tiny(simulators=2, steps=20_000, warmup_steps=20_000)
@@ -48,11 +47,7 @@ def test_it_goes_on_behind_what_is_committed_without_it(simulator):
 def test_it_has_finished_once_a_recorder_has_that_did_not_wait_for_it(simulator, settings_hash):
     core, traffic, behind = simulator()
     peers = Peers('sim')
-    last = Presence(
-        run_id='run', role='record', node='/r/record', instance_id='record 1',
-        settings_hash=settings_hash, finished=False, topics=(),
-        published=np.zeros(0, np.uint64), missed=0,
-    )  # fmt: skip
+    last = presence('record', settings_hash=settings_hash)
     peers.note(last, 0.0)
     traffic.receive(permission(50))
     assert not behind.over(peers) and not core.finished

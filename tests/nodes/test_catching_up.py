@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field
 
-import numpy as np
 import pytest
 
 from codetr_ros.bags.definitions import encode
@@ -13,20 +12,8 @@ from codetr_ros.nodes.asking import SERVICE, Answer
 from codetr_ros.nodes.catching_up import Fetcher
 from codetr_ros.nodes.fetching import AFTER, AGAIN
 from codetr_ros.nodes.peers import Peers
-from codetr_ros.records import INITIAL_VERSION, Commit, Policy, Presence
-from helpers.builders import commit, policy, tiny
-
-LEARNER = Presence(
-    run_id='run',
-    role='learner',
-    node='/learner',
-    instance_id='learner',
-    settings_hash='settings',
-    finished=False,
-    topics=(),
-    published=np.zeros(0, np.uint64),
-    missed=0,
-)
+from codetr_ros.records import INITIAL_VERSION, Commit, Policy
+from helpers.builders import commit, policy, presence, tiny
 
 
 class Waits(Part):
@@ -60,7 +47,7 @@ def fetcher():
         SERVICE: Asked(SERVICE, Answer(None, 'it is not committed')),
     }
     taken, now, peers = [], [0.0], Peers('sim')
-    peers.note(LEARNER, 0.0)
+    peers.note(presence('learner', node='/learner'), 0.0)
     made = Fetcher(
         asked.__getitem__,
         peers,

@@ -1,32 +1,17 @@
 """What has not arrived is counted by who has published it, and each message once."""
 
-import numpy as np
 import pytest
 
 from codetr_ros.nodes.ledger import Ledger
-from codetr_ros.records import Presence
-from helpers.builders import task_spec, transitions
+from helpers.builders import presence, task_spec, transitions
 
 STEPS = [transitions(sequence=number) for number in range(9)]
 
 
-def presence(ledger, stamp, published, instance='sim 1', node='/r/sim', now=0.0):
+def hear(ledger, stamp, published, instance='sim 1', node='/r/sim', now=0.0):
     """Let the ledger hear of a process how many steps it has published."""
-    ledger.note(
-        Presence(
-            run_id='run',
-            role='sim',
-            node=node,
-            instance_id=instance,
-            settings_hash='hash',
-            finished=False,
-            topics=('transitions',),
-            published=np.array([published], np.uint64),
-            missed=0,
-        ),
-        stamp,
-        now,
-    )
+    counts = {'transitions': published}
+    ledger.note(presence('sim', counts, node=node, instance_id=instance), stamp, now)
 
 
 @pytest.fixture
@@ -35,7 +20,7 @@ def ledger():
     made = Ledger(patience=5.0)
     for number in (1, 3, 4, 5):
         made.arrived(STEPS[number], 'sim 1', number)
-    presence(made, 6, 5)
+    hear(made, 6, 5)
     return made
 
 
@@ -61,7 +46,7 @@ def test_a_message_that_comes_twice_or_comes_late_makes_up_for_no_loss(ledger):
     ledger.arrived(STEPS[4], 'sim 1', 4)
     ledger.sent_again(STEPS[7], 'sim 1', 7)
     ledger.arrived(STEPS[7], 'sim 1', 7)  # it was under way
-    presence(ledger, 8, 6)
+    hear(ledger, 8, 6)
     assert ledger.owed() == {'transitions': 1}
 
 
@@ -78,7 +63,7 @@ def test_what_one_node_sends_makes_up_for_no_loss_of_another(ledger):
     for number in range(1, 4):
         ledger.arrived(STEPS[number], 'other 1', number)
     assert ledger.owed() == {'transitions': 1}
-    presence(ledger, 9, 3, 'other 1', '/r/other')
+    hear(ledger, 9, 3, 'other 1', '/r/other')
     assert ledger.owed() == {'transitions': 1}
     assert ledger.owed(without=['sim 1']) == {}
 
@@ -88,14 +73,14 @@ def test_who_begins_late_is_owed_what_is_published_later_alone(ledger):
     ledger.forgive()
     ledger.arrived(STEPS[2], 'sim 1', 2)  # it was under way
     ledger.sent_again(STEPS[0], 'sim 1', 0)
-    presence(ledger, 9, 7)  # of numbers 7 and 8, one is there
+    hear(ledger, 9, 7)  # of numbers 7 and 8, one is there
     assert ledger.owed() == {'transitions': 1}
 
 
 def test_of_a_node_that_was_started_again_only_what_the_new_process_publishes_is_owed(ledger):
-    presence(ledger, 7, 0, 'sim 2')
+    hear(ledger, 7, 0, 'sim 2')
     assert ledger.owed() == {}
-    presence(ledger, 9, 1, 'sim 2')
+    hear(ledger, 9, 1, 'sim 2')
     assert ledger.owed() == {'transitions': 1}
 
 

@@ -1,6 +1,5 @@
 """When a node gives up waiting, and which cause it names."""
 
-import numpy as np
 import pytest
 
 from codetr_ros.nodes.errors import NodeError, first_cause
@@ -8,7 +7,7 @@ from codetr_ros.nodes.ledger import Ledger
 from codetr_ros.nodes.patience import Limit, Patience
 from codetr_ros.nodes.peers import GAVE_UP, Peers
 from codetr_ros.nodes.settling import Settling
-from codetr_ros.records import Presence
+from helpers import builders
 from helpers.builders import tiny
 
 DEADLINE = 60.0
@@ -21,20 +20,7 @@ class Log:
 
 
 def presence(role, doing='works', waiting=0.0, **changes):
-    fields = {
-        'run_id': 'run',
-        'role': role,
-        'node': f'/r/{role}',
-        'instance_id': role,
-        'settings_hash': 'hash',
-        'finished': False,
-        'topics': (),
-        'published': np.zeros(0, np.uint64),
-        'missed': 0,
-        'doing': doing,
-        'waiting': waiting,
-    }
-    return Presence(**(fields | changes))
+    return builders.presence(role, doing=doing, waiting=waiting, **changes)
 
 
 def a_node(role='sim', outside=False, **others):
@@ -99,7 +85,7 @@ def test_the_first_cause_goes_from_node_to_node():
 def evaluator(silent, **changes):
     """A recorder that is about to end, and an evaluator that has published two results."""
     peers = Peers('record')
-    counts = {'topics': ('episodes',), 'published': np.array([2], np.uint64)}
+    counts = {'published': {'episodes': 2}}
     peers.note(presence('evaluate', **(counts | changes)), 200.0 - silent)
     return Settling('/r/record', peers, Limit(DEADLINE))
 
@@ -123,7 +109,7 @@ def test_an_evaluator_that_works_is_waited_for_and_what_a_dead_one_has_published
     assert not settled and 'waits for the end of evaluate /r/evaluate' in doing
     dead, ledger = evaluator(61.0), Ledger()
     for role in ('evaluate', 'sim'):
-        counts = {'topics': ('episodes',), 'published': np.array([2], np.uint64)}
+        counts = {'published': {'episodes': 2}}
         ledger.note(presence(role, **counts), 1, 139.0)
     gone = [peer.presence.instance_id for peer in dead.gone(200.0)]
     missing = ledger.owed(without=gone)

@@ -1,13 +1,9 @@
 """Which nodes of a run are there, have ended, or have given up."""
 
-from dataclasses import replace
-
-import numpy as np
 import pytest
 
 from codetr_ros.nodes.peers import GAVE_UP, Peers
-from codetr_ros.records import Presence
-from helpers.builders import tiny
+from helpers.builders import presence, tiny
 
 
 def test_a_peer_that_has_finished_was_there_so_that_a_short_run_is_not_waited_for_again():
@@ -17,7 +13,7 @@ def test_a_peer_that_has_finished_was_there_so_that_a_short_run_is_not_waited_fo
         if role != 'evaluate':
             assert count == 1
             assert any(role in missing for missing in peers.absent(settings, 'hash'))
-            finished = presence(role, settings_hash='hash', finished=True)
+            finished = presence(role, finished=True)
             peers.note(finished, 0.0)
     assert peers.absent(settings, 'hash') == []
     assert len(peers.absent(settings, 'of another run')) == 4
@@ -26,47 +22,25 @@ def test_a_peer_that_has_finished_was_there_so_that_a_short_run_is_not_waited_fo
 @pytest.mark.parametrize(('settings_hash', 'ending'), [('hash', 'ended'), ('', 'given up')])
 def test_the_log_does_not_call_finished_what_gave_up(settings_hash, ending):
     peers = Peers('learner')
-    assert peers.note(presence('sim', 'hash', False), 0.0) == 'sim /r/sim is there'
-    last = presence('sim', settings_hash, True)
+    assert peers.note(presence('sim'), 0.0) == 'sim /r/sim is there'
+    last = presence('sim', settings_hash=settings_hash, finished=True)
     assert peers.note(last, 1.0) == f'sim /r/sim has {ending}'
-
-
-def presence(role, settings_hash, finished):
-    return Presence(
-        run_id='run',
-        role=role,
-        node=f'/r/{role}',
-        instance_id=role,
-        settings_hash=settings_hash,
-        finished=finished,
-        topics=(),
-        published=np.zeros(0, np.uint64),
-        missed=0,
-    )
 
 
 def test_of_a_node_that_was_killed_and_started_again_only_the_newest_instance_counts():
     peers = Peers('record')
 
-    def presence(instance, finished):
-        published = np.array([2], np.uint64)
-        return Presence(
-            run_id='run',
-            role='evaluate',
-            node='/r/evaluate',
-            instance_id=instance,
-            settings_hash='',
-            finished=finished,
-            topics=('metrics',),
-            published=published,
-            missed=0,
+    def started(instance, finished):
+        counts = {'metrics': 2}
+        return presence(
+            'evaluate', counts, instance_id=instance, settings_hash='', finished=finished
         )
 
-    peers.note(presence('killed', False), 1.0)
+    peers.note(started('killed', False), 1.0)
     assert peers.anybody_left()
-    peers.note(presence('started again', False), 2.0)
+    peers.note(started('started again', False), 2.0)
     assert peers.anybody_left()
-    peers.note(presence('started again', True), 3.0)
+    peers.note(started('started again', True), 3.0)
     assert not peers.anybody_left()
     assert [peer.presence.instance_id for peer in peers.newest()] == ['started again']
 
@@ -74,12 +48,12 @@ def test_of_a_node_that_was_killed_and_started_again_only_the_newest_instance_co
 def test_a_last_presence_is_the_last_even_if_an_earlier_one_arrives_after_it():
     peers = Peers('record')
     for finished in (False, True, False):
-        peers.note(presence('sim', 'hash', finished), 0.0)
+        peers.note(presence('sim', finished=finished), 0.0)
     assert not peers.anybody_left()
 
 
 def simulator(name, **changes):
-    return replace(presence('sim', 'hash', False), node=f'/r/{name}', instance_id=name, **changes)
+    return presence('sim', node=f'/r/{name}', instance_id=name, **changes)
 
 
 def test_a_simulator_that_may_join_takes_the_place_of_none_that_must_be_there():

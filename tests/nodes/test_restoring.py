@@ -11,9 +11,9 @@ from codetr_ros.cores.simulator import Simulator
 from codetr_ros.nodes.kept_run import KeptRun
 from codetr_ros.nodes.peers import Peers
 from codetr_ros.nodes.restoring import Returning, go_on, take_place
-from codetr_ros.records import TOPICS, Commit, Presence
+from codetr_ros.records import TOPICS, Commit
 from codetr_ros.records.fields import type_name
-from helpers.builders import commit, policy, run, task_spec, tiny, transitions
+from helpers.builders import commit, policy, presence, run, task_spec, tiny, transitions
 
 SETTINGS = tiny(joiners=('arm_2',), steps=4000, phase_steps=10, warmup_steps=4000)
 LATE = 20
@@ -49,11 +49,7 @@ def write(kept, record):
 def newcomer():
     core = Simulator(run(SETTINGS), SETTINGS, 'arm_2')
     peers = Peers('sim')
-    there = Presence(
-        run_id='run', role='record', node='/r/record', instance_id='record', settings_hash='hash',
-        finished=False, topics=('commits',), published=np.array([LATE], np.uint64), missed=0,
-    )  # fmt: skip
-    peers.note(there, 0.0)
+    peers.note(presence('record', {'commits': LATE}), 0.0)
     return core, Returning(
         role='sim', name='arm_2', core=core, settings=SETTINGS, peers=peers,
         catch_up=lambda newest: None, begin_counting_anew=lambda: None, log=logging.getLogger(),

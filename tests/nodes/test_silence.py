@@ -1,35 +1,19 @@
 """Who is silent, as one sees it who may have been held himself."""
 
-import numpy as np
 import pytest
 
 from codetr_ros.nodes.attention import AWAY, Attention
 from codetr_ros.nodes.peers import Peers
 from codetr_ros.nodes.silence import Silence
-from codetr_ros.records import Presence
-from helpers.builders import tiny
+from helpers.builders import presence, tiny
 
 SETTINGS = tiny(simulators=2)
-
-
-def presence(node, instance_id):
-    return Presence(
-        run_id='run',
-        role='sim',
-        node=node,
-        instance_id=instance_id,
-        settings_hash='hash',
-        finished=False,
-        topics=(),
-        published=np.zeros(0, np.uint64),
-        missed=0,
-    )
 
 
 def watched(settings=SETTINGS, after=30.0):
     peers = Peers('record')
     for name in ('sim', 'sim_2'):
-        peers.note(presence(f'/r/{name}', name), 0.0)
+        peers.note(presence(node=f'/r/{name}', instance_id=name), 0.0)
     return peers, Silence(peers, settings, after)
 
 
@@ -44,7 +28,7 @@ def look(silence, first, last):
 def test_a_simulator_is_silent_once_nothing_came_for_longer_than_the_deadline():
     peers, silence = watched()
     look(silence, 0, 20)
-    peers.note(presence('/r/sim', 'sim'), 20.0)
+    peers.note(presence('sim'), 20.0)
     assert look(silence, 21, 30) == {}
     assert look(silence, 31, 31) == {'sim_2': 31.0}
 
@@ -52,7 +36,7 @@ def test_a_simulator_is_silent_once_nothing_came_for_longer_than_the_deadline():
 def test_one_that_was_started_again_is_not_silent():
     peers, silence = watched()
     look(silence, 0, 29)
-    peers.note(presence('/r/sim_2', 'another'), 29.0)
+    peers.note(presence(node='/r/sim_2', instance_id='another'), 29.0)
     assert set(look(silence, 30, 40)) == {'sim'}
 
 

@@ -6,10 +6,11 @@ import pytest
 
 from codetr_ros.processes.launcher import Processes
 from codetr_ros.processes.supervise import Interrupts, Silence, supervise, why_it_gave_up
-from codetr_ros.records import Commit, Presence
+from codetr_ros.records import Commit
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import reports
 from codetr_ros.runs.reports import NodeReport
+from helpers.builders import presence
 from helpers.programs import (
     ENDS_WHEN_ASKED,
     READY,
@@ -171,19 +172,7 @@ def test_silence_is_broken_by_news_but_not_by_presence() -> None:
     now = [0.0]
     silence = Silence(lambda: now[0])
     now[0] = 30
-    silence.receive(
-        Presence(
-            run_id='r',
-            role='sim',
-            node='sim',
-            instance_id='i',
-            settings_hash='',
-            finished=False,
-            topics=(),
-            published=(),
-            missed=0,
-        )
-    )  # type: ignore[arg-type]
+    silence.receive(presence('sim'))
     assert silence.seconds == 30
     silence.receive(
         Commit(run_id='r', phase=0, sources=(), transitions=(), scorers=(), scores=(), dropped=())

@@ -16,15 +16,9 @@ from helpers.builders import ACTION as A
 from helpers.builders import OBSERVATION as O
 from helpers.tensors import same
 
+pytestmark = pytest.mark.usefixtures('one_thread')
+
 DELAY, BETA = 10, 1.5
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def fitted(memory: Trajectories, **changes: object) -> Evidence:

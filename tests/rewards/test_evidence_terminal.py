@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import F64, CompositeReward, TrueRewards
@@ -15,16 +14,10 @@ from helpers.builders import ACTION as A
 from helpers.builders import OBSERVATION as O
 from helpers.tensors import same
 
+pytestmark = pytest.mark.usefixtures('one_thread')
+
 DELAY = 10
 LOST = 1.5
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def rewards_of(states: F64, actions: F64, falls: bool) -> F64:

@@ -12,13 +12,13 @@ import pytest
 
 from codetr_ros.cli.audience import Audience
 from codetr_ros.cores import in_process
-from codetr_ros.records import EpisodeResult, Presence, Record, StepRewards
+from codetr_ros.records import EpisodeResult, Record, StepRewards
 from codetr_ros.runs.live import AT_LEAST, SHARE, Live
 from codetr_ros.runs.newest_episode import MOST_CURVES, MOST_HELD, NewestEpisode
 from codetr_ros.runs.progress import Progress
 from codetr_ros.runs.summary import Summary
 from codetr_ros.runs.tensorboard import Events
-from helpers.builders import score, step_rewards, tiny, transitions
+from helpers.builders import presence, score, step_rewards, tiny, transitions
 from helpers.disks import fill, small_disk
 from helpers.summaries import SETTINGS, Clock, a_run
 
@@ -200,15 +200,10 @@ def test_the_nodes_of_a_run_over_topics_are_those_that_are_present(tmp_path: Pat
     for record in a_run():
         audience.receive(record)
     audience.receive(
-        Presence(
+        presence(
+            'reward',
             run_id='r',
-            role='reward',
             node='/run_r/reward',
-            instance_id='i',
-            settings_hash='',
-            finished=False,
-            topics=(),
-            published=np.zeros(0, np.uint64),
             missed=2,
             doing='waits for the commit of phase 3',
             waiting=4.25,

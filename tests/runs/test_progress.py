@@ -3,27 +3,16 @@
 import io
 import re
 
-import numpy as np
 import pytest
 
 from codetr_ros.records import Presence
 from codetr_ros.runs.progress import Progress, duration
+from helpers import builders
 from helpers.summaries import SETTINGS, Clock, a_run, commit
 
 
 def presence(node: str, missed: int = 0) -> Presence:
-    published = np.array([1], np.uint64)
-    return Presence(
-        run_id='r',
-        role='sim',
-        node=node,
-        instance_id='i',
-        settings_hash='',
-        finished=False,
-        topics=('task',),
-        published=published,
-        missed=missed,
-    )
+    return builders.presence('sim', {'task': 1}, run_id='r', node=node, missed=missed)
 
 
 def test_progress_shows_what_nodes_say_that_they_lack() -> None:
