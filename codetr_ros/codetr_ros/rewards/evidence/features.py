@@ -202,18 +202,12 @@ def step_inputs(
     return np.concatenate([after, actions, after - before, *columns], 1)
 
 
-def ends_of(batch: SegmentBatch, inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which steps (N,) of segments led to a terminal state.
-
-    Args:
-        batch: the segments.
-        inside: (B, L) the steps that are asked for.
-    """
-    ends = np.zeros(inside.shape, np.bool_)
+def ends_of(batch: SegmentBatch) -> NDArray[np.bool_]:
+    """Which steps (B, L) of segments led to a terminal state: none but the last can."""
     assert batch.terminated is not None, 'this batch does not come from a memory'
+    ends = np.zeros(batch.actions.shape[:2], np.bool_)
     ends[np.arange(len(ends)), batch.lengths - 1] = batch.terminated
-    asked: NDArray[np.bool_] = ends[inside]
-    return asked
+    return ends
 
 
 def _slices(sizes: Sequence[int]) -> list[slice]:

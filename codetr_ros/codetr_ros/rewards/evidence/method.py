@@ -345,7 +345,7 @@ class Evidence(Predictor):
     def _inputs(self, batch: SegmentBatch, inside: NDArray[np.bool_]) -> Iterator[F32]:
         """What features are made of, of the steps (N,) of segments, in pieces."""
         before, after = batch.observations[:, :-1][inside], batch.observations[:, 1:][inside]
-        ends = ends_of(batch, inside) if self._features.ends else None
+        ends = ends_of(batch)[inside] if self._features.ends else None
         inputs = step_inputs(before, batch.actions[inside], after, ends)
         for i in range(0, len(inputs), PIECE):
             yield inputs[i : i + PIECE]

@@ -15,7 +15,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from codetr_ros.memory.batches import SegmentBatch
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import F32, F64, I64
 from codetr_ros.rewards.evidence.features import (
@@ -163,19 +162,12 @@ class Sampler:
         views: list[V] = []
         for i in range(0, len(ids), GATHERED):
             batch = memory.segments.batch(ids[i : i + GATHERED])
+            ends = ends_of(batch) if self._features.ends else None
             for row, m in enumerate(batch.lengths.tolist()):
                 states, actions = batch.observations[row, : m + 1], batch.actions[row, :m]
-                ends = self._ends(batch, row, m)
-                views.append(look(step_inputs(states[:-1], actions, states[1:], ends)))
+                own = None if ends is None else ends[row, :m]
+                views.append(look(step_inputs(states[:-1], actions, states[1:], own)))
         return views
-
-    def _ends(self, batch: SegmentBatch, row: int, m: int) -> NDArray[np.bool_] | None:
-        """Which steps (m,) of a segment led to a terminal state, where features ask for it."""
-        if not self._features.ends:
-            return None
-        return ends_of(
-            batch.part(slice(row, row + 1)), np.arange(batch.actions.shape[1])[None] < m
-        )
 
 
 def gathered(steps: Tensor, slopes: F64, m: I64) -> Tensor:
