@@ -1,4 +1,4 @@
-"""The standings of methods as tables, for the report of a benchmark and for pages about it."""
+"""The standings of methods as tables, for the report of a benchmark."""
 
 from collections.abc import Sequence
 

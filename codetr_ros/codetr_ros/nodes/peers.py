@@ -162,9 +162,9 @@ class Peers:
             ]:
                 missing.append(f'{role}{of} ({"; ".join(given_up)})')
             else:
-                start = self._commands.get(role) or roles.command(role)
-                self._commands[role] = start  # looked for on the disk
-
+                if role not in self._commands:  # looked for on the disk
+                    self._commands[role] = roles.command(role)
+                start = self._commands[role]
                 missing.append(f'{role}{of} (start it with `{start}` in this namespace)')
         return missing
 

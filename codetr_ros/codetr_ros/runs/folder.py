@@ -7,7 +7,13 @@ from pathlib import Path
 import yaml
 
 from codetr_ros import config
-from codetr_ros.system.files import FileError, atomic_write, check_makeable, check_writable
+from codetr_ros.system.files import (
+    FileError,
+    atomic_write,
+    check_makeable,
+    check_writable,
+    is_partial,
+)
 
 CONFIG = 'config.yaml'
 ORIGIN = 'run.json'
@@ -31,8 +37,6 @@ POLICY = 'policy.safetensors'
 
 EVERY = (NODES, LOGS, CHECKPOINTS)
 """The folders in it that every run has from its beginning on."""
-_HALF_WRITTEN = re.compile(rf'\.({re.escape(CONFIG)}|{re.escape(ORIGIN)})\.\d+\.partial')
-"""Names of the files of `atomic_write` that a start which was killed may leave."""
 
 
 class RunFolderError(ValueError):
@@ -49,7 +53,7 @@ def _left(folder: Path) -> list[Path] | None:
     for entry in folder.iterdir():
         if entry.name in EVERY and entry.is_dir() and not any(entry.iterdir()):
             continue
-        if entry.name != ORIGIN and not _HALF_WRITTEN.fullmatch(entry.name):
+        if entry.name != ORIGIN and not any(is_partial(entry, n) for n in (CONFIG, ORIGIN)):
             return None
         left.append(entry)
     return left

@@ -6,9 +6,12 @@ machine that has lost its power, then sees the whole old file or the whole new o
 
 import errno
 import os
+import re
 import tempfile
 from contextlib import suppress
 from pathlib import Path
+
+_PARTIAL = '.partial'
 
 _REMEDIES = {
     errno.ENOSPC: 'make room',
@@ -113,6 +116,11 @@ def _remove(partial: Path) -> None:
         partial.unlink(missing_ok=True)
 
 
+def is_partial(path: Path, name: str) -> bool:
+    """Whether a file is what `atomic_write` leaves of a file of this name when it is killed."""
+    return bool(re.fullmatch(rf'\.{re.escape(name)}\.\d+{re.escape(_PARTIAL)}', path.name))
+
+
 def atomic_write(path: Path, data: bytes | str, wait: bool = True) -> None:
     """Write a file whole or not at all: temporary name in the same folder, fsync, rename.
 
@@ -126,7 +134,7 @@ def atomic_write(path: Path, data: bytes | str, wait: bool = True) -> None:
         OSError: the disk is full or the folder cannot be written; `path` is then unchanged.
     """
     content = data.encode() if isinstance(data, str) else data
-    partial = path.with_name(f'.{path.name}.{os.getpid()}.partial')
+    partial = path.with_name(f'.{path.name}.{os.getpid()}{_PARTIAL}')
     try:
         write_synced(partial, content, wait)
         os.replace(partial, path)
