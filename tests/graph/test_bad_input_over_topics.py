@@ -148,7 +148,8 @@ class Outcome:
 def outcome(tmp_path_factory):
     """A run that is held in the middle until everybody has got what an intruder sends."""
     folder = tmp_path_factory.mktemp('intruded')
-    settings = tiny(scorers=('visitor',), steps=STEPS)
+    # an early segment is looked at again, however late the run is held
+    settings = tiny(scorers=('visitor',), steps=STEPS, memory_steps=STEPS)
     alone = start(write(settings, folder / 'alone'), folder / 'alone', '--in-process')
     with domain(), Nodes(settings, folder / 'run') as nodes, Witness(nodes) as witness:
         nodes.start_before(witness)

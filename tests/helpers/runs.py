@@ -80,16 +80,17 @@ def logs(folder: Path) -> str:
     return '\n'.join(f'--- {path.name}\n{path.read_text()[-2000:]}' for path in found)
 
 
-def until(found: Callable[[], bool], command: Command, folder: Path) -> None:
-    """Wait until `found()` is true, as long as a command runs."""
+def until(found: Callable[[], Any], command: Command, folder: Path) -> Any:
+    """Wait until `found()` is true, as long as a command runs; what it returns."""
     end = time.monotonic() + DEADLINE
-    while not found():
+    while not (result := found()):
         try:
             code = command.wait(0.1)
         except subprocess.TimeoutExpired:
             assert time.monotonic() < end, f'not within {DEADLINE} s\n{logs(folder)}'
         else:
             raise AssertionError(f'ended with {code}:\n{command.stdout.read()}\n{logs(folder)}')
+    return result
 
 
 def node_of(folder: Path, name: str) -> int:
