@@ -65,6 +65,8 @@ class Liar(Witness):
         run_id: the run.
     """
 
+    followed = tuple(TOPICS)
+
     def __init__(self, nodes: Nodes, seed: int = 0) -> None:
         super().__init__(nodes)
         self.rng = random.Random(seed)

@@ -115,6 +115,12 @@ class Nodes:
         """Exit codes by name, None for those that run."""
         return {node.name: node.code for node in self._processes.nodes}
 
+    def is_stopped(self, name: str) -> bool:
+        """Whether the process of a node stands still because of a signal."""
+        (node,) = [node for node in self._processes.running() if node.name == name]
+        stat = Path(f'/proc/{node.process.pid}/stat').read_text()
+        return stat.rsplit(')', 1)[1].split()[0] == 'T'
+
     def memory(self) -> dict[str, int]:
         """Resident memory [bytes] of the nodes that run, by name."""
         found = {}
@@ -151,9 +157,14 @@ class Nodes:
 class Witness:
     """A node in the namespace of the run that is no part of it.
 
+    Attributes:
+        followed: kinds of records of which `follows` asks that none is missed.
+
     Args:
         nodes: whose death ends the waiting.
     """
+
+    followed: tuple[type, ...] = (Presence, Commit, CompositeReward)
 
     def __init__(self, nodes: Nodes) -> None:
         self._nodes = nodes
@@ -231,7 +242,7 @@ class Witness:
     def follows(self, names: Collection[str]) -> bool:
         """Whether all that these nodes publish, of what is read here, arrives."""
         roles = {name: self._nodes.role(name) for name in names}
-        topics = [TOPICS[kind] for kind in (Presence, Commit, CompositeReward)]
+        topics = [TOPICS[kind] for kind in self.followed]
 
         def writers(topic: str) -> set[str]:
             return {

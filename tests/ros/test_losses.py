@@ -176,6 +176,32 @@ def test_what_was_lost_of_an_early_phase_is_asked_for_though_later_ones_are_whol
     assert report['fetched'] == {'true_rewards': 1}
 
 
+def test_what_is_refused_while_a_node_stays_for_the_recorder_is_in_its_report(play, tmp_path):
+    play = play(settings=settings(), roles=('learner', 'sim'))
+    sim, heard = play.links['sim'], []
+    sim.node.create_subscription(DiagnosticArray, '/diagnostics', heard.append, 10)
+
+    def refused():
+        of = [s for array in heard for s in array.status if s.hardware_id == 'reward']
+        return of and {v.key: v.value for v in of[-1].values}.get('refused transitions')
+
+    with process('record') as record, process('reward', f'folder:={tmp_path}') as node:
+        play.until(lambda: read_by(play, 'record', 'reward') and waits_for_a_phase(play), node)
+        publish_a_phase(play)
+        # it has finished and written its report; the recorder waits for the others
+        play.until(lambda: [p for p in play.presence_of('reward') if p.finished], node)
+        play.claimed = {'transitions': -1}  # that is not of this run
+        sim.publish(transitions(run_id='another'))
+        assert play.until(refused, node) == '1'
+        play.finished = True
+        play.until(lambda: node.poll() is not None and record.poll() is not None)
+        said = output(node)
+    assert node.returncode == 0, said
+    report = json.loads(run_folder.report_path(tmp_path, 'reward', 'reward').read_text())
+    assert report['refused'] == {'transitions': 1}
+    assert report['finished']
+
+
 def test_a_node_gives_up_on_what_was_lost_for_good_naming_topic_and_count(play):
     play = play(settings=settings(), roles=('learner', 'sim', 'record'))
     with process('deaf', 'peer_deadline:=7.0') as deaf:  # and nobody offers to send anything again

@@ -11,7 +11,6 @@ of each environment in a simulator, one episode in the evaluator. A waiting node
 """
 
 import logging
-import resource
 import signal
 import time
 import traceback
@@ -28,11 +27,10 @@ from codetr_ros.ros.gathering import IDLE, wait_for
 from codetr_ros.ros.joining import Joined, LoadCore
 from codetr_ros.ros.membership import Membership
 from codetr_ros.ros.process import SHUTDOWN_DEADLINE, ToRos, in_ros
+from codetr_ros.ros.reporting import Reporting
 from codetr_ros.ros.signals import Stop, Stopped
 from codetr_ros.ros.wiring import Wire, Wiring
-from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import reports
-from codetr_ros.runs.reports import CoreReport
 
 ACK_DEADLINE = 5.0  # [s] at the end for readers that still lack something
 STOPPED_DEADLINE = 0.5
@@ -57,7 +55,7 @@ class Node:
         self._wire = wire
         self._log = member.log
         self._sound = True  # the core is between two slices and can be saved
-        self._started = time.monotonic()
+        self._reporting = Reporting(member)
 
     def run(self) -> int:
         """Do everything from the parameters to the last message; returns the exit code."""
@@ -151,8 +149,9 @@ class Node:
         if error:
             self.member.give_up(error)
         steps: list[Callable[[], None]] = [
-            lambda: self._report(wiring, finished, error),
+            lambda: self._reporting.write(wiring, finished, error),
             lambda: self._linger(finished),
+            self._reporting.add_late_refusals,
             self._take_leave,
         ]
         if wiring is not None:
@@ -190,30 +189,6 @@ class Node:
         error = f'stopped by {number.name} before the run was over: {"; ".join(failed)}'
         self._log.error(f'{error}. Look at the log of that node')
         return error
-
-    def _report(self, wiring: Wiring | None, finished: bool, error: str | None) -> None:
-        member = self.member
-        if member.folder is None:
-            return
-        used = resource.getrusage(resource.RUSAGE_SELF)
-        core_report = wiring.joined.core.report() if wiring else CoreReport()
-        report = reports.node_report(
-            core_report,
-            role=member.role,
-            name=member.link.name,
-            published={t: n for t, n in member.link.published.items() if t != 'presence'},
-            received=member.traffic.received,
-            refused=member.traffic.refused,
-            lost=member.traffic.lost(),
-            fetched=member.traffic.recovered,
-            cpu_s=used.ru_utime + used.ru_stime,
-            wall_s=time.monotonic() - self._started,
-            finished=finished,
-            error=error,
-            own=wiring.report() if wiring else None,
-        )
-        path = run_folder.report_path(member.folder, member.role, member.link.name)
-        reports.write(path, report)
 
     def _linger(self, finished: bool) -> None:
         """Stay until the recorder has finished: it, or a node that is started again, may lack what
