@@ -39,9 +39,7 @@ def starter() -> Start:
     """Starts programs as `forked.start_program` does, the first simulator as one that stops."""
     started = set()
 
-    def start(
-        arguments: Sequence[str], environment: Mapping[str, str], log: BinaryIO
-    ) -> Process:
+    def start(arguments: Sequence[str], environment: Mapping[str, str], log: BinaryIO) -> Process:
         name = Path(arguments[0]).name
         stops = name == 'sim' and name not in started
         started.add(name)
@@ -49,4 +47,3 @@ def starter() -> Start:
         return Forked(arguments, environment, log, function, death=signal.SIGINT)
 
     return start
-
