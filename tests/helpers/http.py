@@ -20,7 +20,7 @@ def ask(
     body: bytes | None = None,
 ) -> Answer:
     """Ask a server of this machine; `Host` is its own unless given."""
-    connection = http.client.HTTPConnection('127.0.0.1', port, timeout=60)
+    connection = http.client.HTTPConnection('127.0.0.1', port, timeout=120)
     try:
         given = dict(headers or {})
         connection.putrequest(method, path, skip_host='Host' in given)

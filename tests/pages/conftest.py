@@ -1,5 +1,6 @@
 """A real browser for the pages. It reaches the server of the test and nothing else."""
 
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,11 @@ FLAGS = (
     *('--disable-background-networking', '--disable-component-update', '--disable-sync'),
 )
 NARROW, WIDE = 400, 1200
+PATIENCE = 120_000  # [ms]
+GONE = re.compile(
+    r'net::ERR_(CONNECTION_(REFUSED|RESET|CLOSED)|EMPTY_RESPONSE|INCOMPLETE_CHUNKED_ENCODING)'
+)
+"""What a tab says of a server that has ended, or that ends while it asks for something."""
 
 
 @pytest.fixture(scope='package')
@@ -39,7 +45,7 @@ def tab(browser: Any) -> Iterator[Callable[..., Any]]:
     def open_tab(url: str, width: int = WIDE, **more: Any) -> Any:
         context = browser.new_context(viewport={'width': width, 'height': 900}, **more)
         page = context.new_page()
-        page.set_default_timeout(10_000)
+        page.set_default_timeout(PATIENCE)
         page.elsewhere, page.errors = [], []
         own = urlsplit(url).netloc
 
@@ -52,7 +58,7 @@ def tab(browser: Any) -> Iterator[Callable[..., Any]]:
 
         def heard(message: Any) -> None:
             # a server may end before the tab, which then asks for it again
-            if message.type == 'error' and 'ERR_CONNECTION_REFUSED' not in message.text:
+            if message.type == 'error' and not GONE.search(message.text):
                 page.errors.append(message.text)
 
         page.route(lambda address: urlsplit(address).scheme not in ('data', 'blob'), through)

@@ -24,7 +24,7 @@ from codetr_ros.simulation.replay import Recorded, replay
 from helpers.builders import tiny
 from helpers.http import ask
 
-DEADLINE = 60.0  # [s]
+DEADLINE = 120.0  # [s]
 
 
 @pytest.fixture(scope='module')

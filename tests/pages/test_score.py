@@ -128,12 +128,26 @@ def test_a_click_is_confirmed_within_a_tenth_of_a_second(tab):
         opened = tab(server.url)
         opened.get_by_text('steps 35 to 41').wait_for()
         took = []
-        for number, point in enumerate('1234'):
-            opened.keyboard.press(point)
-            opened.get_by_text(f'Number {number}: {point}').wait_for()
+        # one of some: the machine of a test may be busy with other things
+        while len(took) < 6 and min(took, default=100) >= 100:
+            opened.keyboard.press('4')
+            opened.get_by_text(f'Number {len(took)}: 4').wait_for()
             took.append(float(opened.locator('#confirmed').get_attribute('data-ms')))
-        # the best of some: the machine of a test may be busy with other things
         assert min(took) < 100
+
+
+def test_what_was_just_judged_is_not_shown_again_however_late_the_page_gets_the_news(tab):
+    desk = a_desk(asked=6)
+    with served(desk) as (server, page):
+        opened = tab(server.url)
+        opened.get_by_text('steps 35 to 41').wait_for()
+        page.tick = lambda: None  # they are still on their way
+        for number, key in enumerate('2='):
+            opened.keyboard.press(key)
+            opened.get_by_text(f'Number {number}: 2').wait_for()
+        opened.keyboard.press('c')
+        opened.get_by_text('steps 56 to 62 | sim, episode 0, steps 7 to 13').wait_for()
+        assert judged(desk) == [(35, 2.0), (14, 2.0)]
 
 
 def test_the_page_can_be_used_at_400_pixels_and_by_keyboard_alone(tab):

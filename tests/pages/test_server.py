@@ -224,7 +224,7 @@ def test_a_stream_begins_with_the_newest_values_and_goes_on_with_changes(feed: F
     feed.publish('b', 1)
     feed.publish('b', 2)
     with Server(ROUTES, feed) as server:
-        connection = http.client.HTTPConnection('127.0.0.1', server.address.port, timeout=60)
+        connection = http.client.HTTPConnection('127.0.0.1', server.address.port, timeout=120)
         stream = events(connection)
         first = next_event(stream)
         assert (first['event'], first['data']) == ('a', '{"text":"line\\nline","gap":null}')
@@ -237,7 +237,7 @@ def test_a_stream_begins_with_the_newest_values_and_goes_on_with_changes(feed: F
 
 def test_the_server_stops_while_a_page_looks(feed: Feed):
     with Server(ROUTES, feed) as server:
-        connection = http.client.HTTPConnection('127.0.0.1', server.address.port, timeout=60)
+        connection = http.client.HTTPConnection('127.0.0.1', server.address.port, timeout=120)
         stream = events(connection)
         feed.publish('a', 1)
         next_event(stream)

@@ -5,9 +5,10 @@ import { at, follow, make, number, send, write } from './page.js';
 const KEYS = '= same as before, x can\'t tell, s later, c compare.';
 const FRAME_MS = 100;
 const state = { scale: [1, 5], desk: null, later: [], shown: [], correcting: null, last: null,
-  comparing: false, busy: false };
+  stated: [], comparing: false, busy: false };
 
 const same = (one, other) => JSON.stringify(one) === JSON.stringify(other);
+const isIn = (segments, one) => segments.some((each) => same(each, one));
 
 function words([source, episode, first, length]) {
   return `${source}, episode ${episode}, steps ${first} to ${first + length - 1}`;
@@ -95,8 +96,9 @@ function keysOfPoints() {
 /** The segments to judge now: one, or two to be compared. */
 function due() {
   if (state.correcting) return state.correcting;
-  const waiting = state.desk ? state.desk.waiting : [];
-  const now = waiting.filter((each) => !state.later.some((later) => same(each, later)));
+  // the desk that knows of the last statement may still be on its way
+  const waiting = (state.desk ? state.desk.waiting : []).filter((each) => !isIn(state.stated, each));
+  const now = waiting.filter((each) => !isIn(state.later, each));
   const rest = [...now, ...waiting.filter((each) => !now.includes(each))];
   return rest.slice(0, state.comparing ? 2 : 1);
 }
@@ -169,7 +171,7 @@ function renderGiven() {
   at('given').replaceChildren(...rows);
 }
 
-const waits = (segment) => [...state.desk.waiting, ...(state.correcting ?? [])].some((each) => same(each, segment));
+const waits = (segment) => isIn([...state.desk.waiting, ...(state.correcting ?? [])], segment);
 
 function refuse(error) {
   write(at('refused'), error.message);
@@ -190,6 +192,7 @@ async function judge(statement) {
     at('confirmed').dataset.ms = String(took);
     state.correcting = null;
     state.shown = [];
+    state.stated.push(given.segment, ...(given.other ? [given.other] : []));
   } catch (error) {
     refuse(error);
   } finally {
@@ -269,7 +272,11 @@ document.addEventListener('keydown', (event) => {
 follow(
   {
     scale: (scale) => { state.scale = scale; renderScale(); },
-    desk: (desk) => { state.desk = desk; render(); },
+    desk: (desk) => {
+      state.desk = desk;
+      state.stated = state.stated.filter((each) => isIn(desk.waiting, each));
+      render();
+    },
   },
   (link) => write(at('link'), link === 'live' ? '' : 'The server does not answer.'),
 );
