@@ -5,7 +5,7 @@ subscriptions cannot distinguish a recorder from `ros2 topic echo`. From then on
 (reliable, deep enough queues). The counts that peers publish show a node what never reached it.
 """
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 
 from codetr_ros.config import Settings
@@ -181,15 +181,23 @@ class Peers:
         Args:
             among: the nodes that count; None: all.
         """
-        died, given_up = [], []
+        return [f'{peer.who} has died' for peer in self.gone(among)] or [
+            f'{peer.who} has given up{f" ({peer.cause})" if peer.cause else ""}'
+            for peer in self._failed(among)
+        ]
+
+    def gone(self, among: Iterable[Peer] | None = None) -> list[Peer]:
+        """Those of them whose processes have ended, and whose last presence has not come.
+
+        Args:
+            among: the nodes that count; None: all.
+        """
+        return [peer for peer in self._failed(among) if not peer.presence.finished]
+
+    def _failed(self, among: Iterable[Peer] | None) -> Iterator[Peer]:
         for peer in self.newest() if among is None else among:
             if peer.failed and not peer.dispensable and not self._comes_and_goes(peer):
-                if peer.presence.finished:
-                    why = f' ({peer.cause})' if peer.cause else ''
-                    given_up.append(f'{peer.who} has given up{why}')
-                else:
-                    died.append(f'{peer.who} has died')
-        return died or given_up
+                yield peer
 
     def cause(self) -> str:
         """The first cause for which others have given up, as far as it is known; else empty.

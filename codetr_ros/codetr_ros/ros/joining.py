@@ -11,6 +11,7 @@ from typing import Any
 
 from codetr_ros.config import IN_PROCESS_ONLY, Settings, from_canonical, settled
 from codetr_ros.cores.core import Core
+from codetr_ros.nodes import leaving
 from codetr_ros.nodes.errors import NodeError
 from codetr_ros.nodes.signing import VARIABLE, is_keyed
 from codetr_ros.processes.openmp import threading_environment
@@ -184,6 +185,8 @@ def join(
             origin.write(folder, origin.origin(settings, run.run_id, namespace, False, True, None))
         if not begun:
             run_folder.write_settings(folder, settings)  # the last: from now on it can go on
+    if folder:
+        leaving.forget_report(folder, member.role, link.name)
     checkpoints = folder / run_folder.CHECKPOINTS if folder else None
     core = make_core(run, settings, link.name, checkpoints, **member.core_values)
     member.serve(core, settings)

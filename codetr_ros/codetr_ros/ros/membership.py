@@ -11,6 +11,7 @@ import numpy as np
 from codetr_ros.bags.definitions import stamp_of
 from codetr_ros.config import Settings, SettingsError, from_canonical
 from codetr_ros.cores.core import Core
+from codetr_ros.nodes import leaving
 from codetr_ros.nodes.admission import Admission
 from codetr_ros.nodes.catching_up import Fetcher
 from codetr_ros.nodes.errors import NodeError, first_cause
@@ -38,6 +39,10 @@ from codetr_ros.ros.signals import Stop
 from codetr_ros.system.files import FileError, check_makeable
 
 PRESENCE_EVERY = 1.0  # [s] between two messages of presence and diagnostics
+HEARS_FOR = 0.05
+"""Seconds to block for the last presences of others."""
+HEARS_OUT = 20
+"""How often: a second, if nothing comes."""
 
 
 class Membership:
@@ -397,6 +402,18 @@ class Membership:
         if finished or self.waits_since is None:
             return 0.0
         return time.monotonic() - self.waits_since
+
+    def hear_out(self) -> None:
+        """Take the last presences of nodes whose processes have ended: they may still be on their
+        way. Of one that was lost, its report takes the place.
+        """
+        self.link.handle()
+        for _ in range(HEARS_OUT):  # so that it does not matter how long this process is held
+            if not self.peers.gone():
+                return
+            self.link.handle(HEARS_FOR)
+        if self.folder is not None:
+            leaving.take_reports(self.peers, self.folder, time.monotonic())
 
     def close(self) -> None:
         """Take the node and its company off the graph."""

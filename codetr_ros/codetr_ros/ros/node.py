@@ -182,7 +182,7 @@ class Node:
         member = self.member
         if not member.begun:
             return None
-        member.link.handle()  # the last presences
+        member.hear_out()
         failed = member.peers.failed()
         if not failed:
             return None
