@@ -1,7 +1,6 @@
 """A trained policy on a robot in real processes and real time: no run, no learner, no torch."""
 
 import signal
-import time
 
 import numpy as np
 import pytest
@@ -29,19 +28,18 @@ def test_it_drives_the_arm_at_its_rate_within_its_limits_and_obeys_silence_and_p
         person.link.handle(0.2)
         assert person.commands == []
         person.activate()
-        person.ticks(1)
-        began = time.monotonic()
-        person.ticks(40)
-        assert 1.8 < time.monotonic() - began < 4.0  # two seconds at 20 Hz
-        assert person.moves()
+        person.until(lambda: person.took(40, 1.8, 4.0))  # two seconds at 20 Hz
+        person.until(person.moves)
         assert 'libtorch' not in run.mapped('robot')
         commands = np.array(person.commands)
         assert (np.abs(commands) <= 0.8).all()
-        assert (np.abs(np.diff(commands, axis=0)) <= 4.0 / 20 + 1e-9).all()
+        # it stops at once, where this machine keeps the arm or the node waiting
+        changes = np.diff(commands, axis=0)[commands[1:].any(axis=1)]
+        assert (np.abs(changes) <= 4.0 / 20 + 1e-9).all()
 
         run.end('arm', signal.SIGSTOP)
         person.until(person.rests)
-        assert '/joint_states is' in run.log('robot')
+        person.until(lambda: '/joint_states is' in run.log('robot'))
         run.end('arm', signal.SIGCONT)
         person.until(person.moves)  # it goes on by itself
 
@@ -50,15 +48,13 @@ def test_it_drives_the_arm_at_its_rate_within_its_limits_and_obeys_silence_and_p
         assert person.call('resume').success
         person.until(person.moves)
         assert person.change('deactivate')
-        person.link.handle(0.2)
-        assert not any(person.commands[-1])
+        person.until(lambda: not any(person.commands[-1]))
         person.activate()
         person.until(person.moves)
 
         run.end('robot', signal.SIGTERM)
         person.until(lambda: run.codes()['robot'] is not None)
-        person.link.handle(0.2)
-        assert not any(person.commands[-1])
+        person.until(lambda: not any(person.commands[-1]))
         assert run.codes()['robot'] == 0
         assert 'commands changed by limit change' in run.log('robot')
         assert 'control deadlines missed' in run.log('robot')

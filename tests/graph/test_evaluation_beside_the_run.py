@@ -2,6 +2,7 @@
 
 import os
 import signal
+from contextlib import ExitStack
 
 import pytest
 
@@ -12,6 +13,7 @@ from kills import phase_of
 from codetr_ros.cores import in_process
 from helpers import layout
 from helpers.builders import tiny
+from helpers.holding import held
 from helpers.nodes import NAMESPACE, Nodes, Witness, domain
 from helpers.runs import finish, node_of, start, until, write
 
@@ -33,10 +35,16 @@ def plotted(witness):
 def test_an_evaluator_that_stands_still_delays_no_phase_and_makes_up_for_it(tmp_path):
     settings = tiny(steps=3000)
     last = settings.phases - 1
-    with domain(), Nodes(settings, tmp_path / 'run') as nodes, Witness(nodes) as witness:
+    with (
+        domain(),
+        held(tmp_path / 'held', 5) as hold,
+        Nodes(settings, tmp_path / 'run') as nodes,
+        Witness(nodes) as witness,
+    ):
         nodes.start_before(witness)
         witness.until(plotted(witness))
         nodes.send(signal.SIGSTOP, 'evaluate')
+        hold.release()
         witness.until(lambda: witness.committed(last))  # under a policy that it should evaluate
         nodes.send(signal.SIGCONT, 'evaluate')
         codes = nodes.wait()
@@ -50,21 +58,35 @@ def test_an_evaluator_that_stands_still_delays_no_phase_and_makes_up_for_it(tmp_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGSTOP])
-def test_a_run_whose_evaluator_is_lost_for_good_ends_well_and_counts_what_is_missing(
-    tmp_path, number
-):
-    settings, folder = tiny(steps=2000, threads=1), tmp_path / 'run'
-    flags = ('--restarts', '0', '--peer-deadline', '5')
-    command = start(write(settings, folder), folder, *flags)
-    try:
-        until(lambda: phase_of(folder) >= 2, command, folder)
-        os.kill(node_of(folder, 'evaluate'), number)
-        summary, said = finish(command, folder)
-    finally:
-        command.kill()
+def test_runs_whose_evaluators_are_lost_for_good_end_well_and_count_what_is_missing(tmp_path):
+    settings, numbers = tiny(steps=2000, threads=1), (signal.SIGKILL, signal.SIGSTOP)
+    folders = [tmp_path / number.name for number in numbers]
+    with ExitStack() as cleanup:  # one waits for its evaluator while the other begins
+        runs = [
+            lost(settings, folder, number, cleanup)
+            for folder, number in zip(folders, numbers, strict=True)
+        ]
+        ended = [finish(command, folder) for command, folder in zip(runs, folders, strict=True)]
     undisturbed = in_process.run(settings, 'calls')
-    assert summary['policy_sha256'] == undisturbed['learner'].policy_sha256
+    for folder, (summary, said) in zip(folders, ended, strict=True):
+        assert summary['policy_sha256'] == undisturbed['learner'].policy_sha256
+        check_missing(settings, folder, summary, said)
+
+
+def lost(settings, folder, number, cleanup):
+    """A run that goes on behind its second phase without its evaluator."""
+    with held(folder.with_suffix('.held'), 3):
+        # no node may be given up that the machine lets stand still meanwhile
+        flags = ('--restarts', '0', '--peer-deadline', '20')
+        command = start(write(settings, folder), folder, *flags)
+        cleanup.callback(command.kill)
+        until(lambda: phase_of(folder) >= 1, command, folder)
+        os.kill(node_of(folder, 'evaluate'), number)
+    return command
+
+
+def check_missing(settings, folder, summary, said):
+    """The evaluations that are missing are counted, wherever people look."""
     assert summary['failure'] is None and summary['steps'] == settings.steps
     missing, there = summary['evaluations_missing'], len(summary['evaluations'])
     due = sum(map(settings.evaluated, range(settings.phases)))

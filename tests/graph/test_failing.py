@@ -29,9 +29,12 @@ def deserted(tmp_path_factory):
             nodes.start(name)
         # lines come once a second at the most: one of an update may be later than its phase
         witness.until(lambda: witness.committed(3) and ': critic_loss ' in nodes.log('learner'))
+        # held, or they would give up by themselves, if it took long until they are asked
+        nodes.send(signal.SIGSTOP, 'reward', 'record', 'learner')
         nodes.send(signal.SIGKILL, 'sim')
         nodes.wait('sim')
         nodes.send(signal.SIGINT)
+        nodes.send(signal.SIGCONT)
         nodes.wait()
     return nodes
 
@@ -70,11 +73,12 @@ def test_a_node_that_has_given_up_is_one_that_has_failed(tmp_path):
         checkpoints.rename(tmp_path / 'away')
         checkpoints.touch()
         nodes.wait('learner')
+        gave_up = f'learner {NAMESPACE}/learner has given up'
+        witness.until(lambda: all(gave_up in nodes.log(name) for name in ('sim', 'record')))
         nodes.send(signal.SIGINT)
         codes = nodes.wait()
     assert codes['learner'] == codes['sim'] == codes['record'] == 1, codes
     assert 'Traceback' not in nodes.log('learner')
-    assert f'learner {NAMESPACE}/learner has given up' in nodes.log('sim')
     for name in ('sim', 'record'):  # they have ended because of it, and name what it met
         assert str(checkpoints) in nodes.report(name)['error']
 

@@ -9,6 +9,7 @@ pytest.importorskip('rclpy', reason='needs ROS')
 
 from codetr_ros.bags.verify import verify
 from codetr_ros.cores import in_process
+from helpers import holding
 from helpers.builders import tiny
 from helpers.nodes import Nodes, Witness
 
@@ -20,13 +21,18 @@ APART = 2.0  # [s] from one to the next: several are held at the same time
 @pytest.mark.slow
 def test_every_node_is_held_for_a_while_and_the_weights_are_the_same(tmp_path):
     undisturbed = in_process.run(SETTINGS, 'run')
-    with Nodes(SETTINGS, tmp_path / 'run') as nodes, Witness(nodes) as witness:
+    with (
+        holding.held(tmp_path / 'held', 3) as hold,
+        Nodes(SETTINGS, tmp_path / 'run') as nodes,
+        Witness(nodes) as witness,
+    ):
         nodes.start_before(witness)
         witness.until(lambda: witness.committed(2))
         held = {}
         for name in nodes.names:
             nodes.send(signal.SIGSTOP, name)
             held[name] = time.monotonic()
+            hold.release()  # nothing ends without the first of them
             witness.until(lambda name=name: time.monotonic() - held[name] > APART)
         for name, since in held.items():
             witness.until(lambda since=since: time.monotonic() - since > HELD)

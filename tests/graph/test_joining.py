@@ -3,13 +3,12 @@
 import os
 import shlex
 import signal
-from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS')
-
-from kills import phase_of
 
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.verify import verify
@@ -17,8 +16,9 @@ from codetr_ros.nodes.signing import VARIABLE
 from codetr_ros.offline.replay import replay
 from helpers.builders import tiny
 from helpers.forked import Forked
-from helpers.nodes import Nodes, Witness
-from helpers.runs import finish, node_of, start, until, write
+from helpers.holding import held
+from helpers.nodes import NAMESPACE, Nodes, Witness
+from helpers.runs import finish, start, write
 
 JOINERS = ('arm_3', 'arm_4')
 SETTINGS = tiny(
@@ -26,29 +26,30 @@ SETTINGS = tiny(
 )
 
 
-@contextmanager
-def going_on(nodes):
-    """Let the run go on for a while. Else it is held, so that it is not over before others have
-    started.
+def go_on(hold, witness, found):
+    """Let a held run go on, phase by phase, until a commit from now on is one that is looked for;
+    that commit.
     """
-    nodes.send(signal.SIGCONT, 'learner')
-    yield
-    nodes.send(signal.SIGSTOP, 'learner')
-
-
-def join(nodes, witness):
-    """Start those that join, and wait until a commit has steps of them."""
     since = len(witness.commits)
-    before = {name: witness.presence.get(name) for name in JOINERS}
-    for name in JOINERS:
-        nodes.start(name)
-    witness.until(lambda: all(witness.presence.get(n) is not before[n] for n in JOINERS))
-    with going_on(nodes):
-        witness.until(lambda: any(has_all(commit) for commit in witness.commits[since:]))
+    while not (there := [each for each in witness.commits[since:] if found(each)]):
+        witness.until(lambda: witness.committed(hold.phase - 1))
+        hold.before(hold.phase + 1)
+    return there[0]
 
 
-def has_all(commit):
-    return set(JOINERS) <= set(commit.sources) and not commit.dropped
+def instance_of(witness, name):
+    return witness.presence[name].instance_id if name in witness.presence else ''
+
+
+def join(start, hold, witness, names):
+    """Start those that join, and let the run go on until a commit has steps of them."""
+    before = {name: instance_of(witness, name) for name in names}
+    for name in names:
+        start(name)
+    for name in names:
+        witness.until(lambda n=name: instance_of(witness, n) != before[n])
+        witness.until(lambda n=name: 'waits for permission' in witness.presence[n].doing)
+    go_on(hold, witness, lambda commit: set(names) <= set(commit.sources) and not commit.dropped)
 
 
 def weights_again(folder, phases):
@@ -64,26 +65,27 @@ def weights_again(folder, phases):
 
 @pytest.mark.slow
 def test_two_then_four_simulators_join_leave_and_join_again(tmp_path):
-    with Nodes(SETTINGS, tmp_path / 'run') as nodes, Witness(nodes) as witness:
+    with (
+        held(tmp_path / 'held', 3) as hold,
+        Nodes(SETTINGS, tmp_path / 'run') as nodes,
+        Witness(nodes) as witness,
+    ):
         first = [name for name in nodes.names if name != 'sim_2']
         for name in first:
             nodes.start(name, *(['leave_out_after:=3.0'] if name == 'record' else []))
         witness.until(lambda: witness.follows(first))
         nodes.start('sim_2')
-        with going_on(nodes):
-            witness.until(lambda: witness.committed(2))
-        assert set(witness.commits[-1].sources) == {'sim', 'sim_2'}
-        assert set(witness.commits[-1].dropped) == set(JOINERS)
-        join(nodes, witness)
+        two = go_on(hold, witness, lambda commit: set(commit.sources) == {'sim', 'sim_2'})
+        assert set(two.dropped) == set(JOINERS)
+        join(nodes.start, hold, witness, JOINERS)
         nodes.send(signal.SIGKILL, 'arm_4')
         nodes.send(signal.SIGINT, 'arm_3')
-        with going_on(nodes):
-            witness.until(lambda: set(JOINERS) <= set(witness.commits[-1].dropped))
+        go_on(hold, witness, lambda commit: set(JOINERS) <= set(commit.dropped))
         left = nodes.wait(*JOINERS)
         assert [left[name] for name in JOINERS] == [0, -signal.SIGKILL]
-        assert 'sim /run_run/arm_3 has ended' in nodes.log('learner')
-        join(nodes, witness)
-        nodes.send(signal.SIGCONT, 'learner')
+        witness.until(lambda: 'sim /run_run/arm_3 has ended' in nodes.log('learner'))
+        join(nodes.start, hold, witness, JOINERS)
+        hold.release()
         codes = nodes.wait()
     assert codes == dict.fromkeys((*nodes.names, *JOINERS), 0)
     for name in JOINERS:
@@ -96,50 +98,52 @@ def test_two_then_four_simulators_join_leave_and_join_again(tmp_path):
     assert weights_again(nodes.folder, SETTINGS.phases) == weights
 
 
-@contextmanager
-def held(folder):
-    """Hold the learner, so that the run is not over before others have started."""
-    learner = node_of(folder, 'learner')
-    os.kill(learner, signal.SIGSTOP)
-    try:
-        yield
-    finally:
-        os.kill(learner, signal.SIGCONT)
+@dataclass
+class Started:
+    """A run that `codetr train` has started, as far as a witness asks for it."""
+
+    folder: Path
+    command: Forked
+    key: str
+
+    def codes(self):
+        """The exit code of the command, None while it runs."""
+        return {'train': self.command.poll()}
 
 
 @pytest.mark.slow
 def test_a_simulator_joins_by_the_command_that_codetr_train_prints(tmp_path, monkeypatch):
-    monkeypatch.setenv(VARIABLE, '5a' * 32)
+    key = '5a' * 32
+    monkeypatch.setenv(VARIABLE, key)
     settings = SETTINGS.changed({'simulators': 1, 'joiners': ('arm_2',)})
     folder, log = tmp_path / 'run', tmp_path / 'arm_2.log'
-    command = start(write(settings, folder), folder, '--leave-out-after', '3')
-    try:
-        lines = iter(command.stdout.readline, '')
-        words = shlex.split(next(line for line in lines if '__node:=arm_2' in line))
-        until(lambda: phase_of(folder) >= 2, command, folder)
+    flags = ('--namespace', NAMESPACE, '--leave-out-after', '3', '--peer-deadline', '300')
+    with held(tmp_path / 'held', 3) as hold:
+        command = start(write(settings, folder), folder, *flags)
+        try:
+            with Witness(Started(folder, command, key)) as witness:
+                lines = iter(command.stdout.readline, '')
+                words = shlex.split(next(line for line in lines if '__node:=arm_2' in line))
+                joiners = []
 
-        def join(news):
-            with held(folder), log.open('ab') as output:
-                joiner = Forked(words, os.environ, output)
-                started = log.read_text().count('is there')
-                until(lambda: log.read_text().count('is there') > started, command, folder)
-            until(lambda: news in log.read_text(), command, folder)
-            return joiner
+                def begin(name):
+                    with log.open('ab') as output:
+                        joiners.append(Forked(words, os.environ, output))
 
-        join('joins the run with phase').kill()
-        out = 'arm_2 is left out of phase'
-        until(lambda: out in said_by(folder, 'record'), command, folder)
-        joiner = join('joins the run again with phase')
-        summary, _ = finish(command, folder)
-        assert joiner.wait(120) == 0
-    finally:
-        command.kill()
+                witness.until(lambda: witness.committed(2))
+                join(begin, hold, witness, ['arm_2'])
+                assert 'joins the run with phase' in log.read_text()
+                joiners[0].kill()
+                go_on(hold, witness, lambda commit: 'arm_2' in commit.dropped)
+                assert 'arm_2 is left out of phase' in (folder / 'logs' / 'record.log').read_text()
+                join(begin, hold, witness, ['arm_2'])
+                assert 'joins the run again with phase' in log.read_text()
+                hold.release()
+            summary, _ = finish(command, folder)
+            assert joiners[1].wait(120) == 0
+        finally:
+            command.kill()
     assert summary['failure'] is None
     assert summary['left_out']['arm_2'] >= 1
     weights = [summary['policy_sha256'], summary['reward_model_sha256']]
     assert weights_again(folder, settings.phases) == weights
-
-
-def said_by(folder, name):
-    log = folder / 'logs' / f'{name}.log'
-    return log.read_text() if log.exists() else ''

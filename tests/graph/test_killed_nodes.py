@@ -7,10 +7,12 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS')
 
-from kills import nodes, phase_of
+from kills import nodes
 
+from codetr_ros.runs import folder as run_folder
 from helpers.builders import tiny
-from helpers.runs import finish, start_installed, train, until, write
+from helpers.holding import held
+from helpers.runs import finish, start, train, until, write
 
 SETTINGS = tiny(steps=1600)
 DIGESTS = ('policy_sha256', 'reward_model_sha256')
@@ -32,15 +34,18 @@ def test_nodes_killed_at_once_join_again_and_the_weights_are_the_same(
     tmp_path, undisturbed, roles
 ):
     folder = tmp_path / 'run'
-    command = start_installed(write(SETTINGS, folder), folder, '--no-film')
-    try:
-        until(lambda: phase_of(folder) >= 3, command, folder)
-        there = nodes(folder)
-        for role in roles:
-            os.kill(there[role], signal.SIGKILL)
-        summary, said = finish(command, folder)
-    finally:
-        command.kill()
+    learnt = folder / run_folder.CHECKPOINTS / 'learner-000002'
+    with held(tmp_path / 'held', 4) as hold:
+        command = start(write(SETTINGS, folder), folder)
+        try:
+            until(learnt.is_dir, command, folder)
+            there = nodes(folder)
+            for role in roles:
+                os.kill(there[role], signal.SIGKILL)
+            hold.release()
+            summary, said = finish(command, folder)
+        finally:
+            command.kill()
     assert [summary[name] for name in DIGESTS] == undisturbed
     again = {use['role']: use['restarts'] for use in summary['processes'].values()}
     assert {role for role, times in again.items() if times} == set(roles)

@@ -20,6 +20,7 @@ from typing import IO, Any, BinaryIO
 
 from codetr_ros.cli import train
 from codetr_ros.processes import launcher
+from helpers import holding
 
 READ_AT_IMPORT = {'OMP_NUM_THREADS': '1'}
 """What the fork server has imported with: no child of it can have this otherwise."""
@@ -163,8 +164,12 @@ class Forked:
 def start_program(
     arguments: Sequence[str], environment: Mapping[str, str], log: BinaryIO
 ) -> launcher.Process:
-    """Fork what the launcher would start, with the same death: see `launcher.start_program`."""
-    return Forked(arguments, environment, log, death=signal.SIGINT)
+    """Fork what the launcher would start, with the same death: see `launcher.start_program`. The
+    learner of a run that is held by a test is the one that can be held.
+    """
+    held = holding.VARIABLE in environment and Path(arguments[0]).name == 'learner'
+    function = 'helpers.holding:learner' if held else None
+    return Forked(arguments, environment, log, function, death=signal.SIGINT)
 
 
 def codetr(*arguments: str, environment: Mapping[str, str], **options: Any) -> Forked:

@@ -23,13 +23,13 @@ from codetr_ros.config import Settings
 from codetr_ros.nodes.signing import VARIABLE, is_signed, key_of
 from codetr_ros.processes import launcher
 from codetr_ros.records import TOPICS, Commit, CompositeReward, Presence, Record, RecordError
-from codetr_ros.records.roles import published_by
+from codetr_ros.records.roles import published_by, read_by
 from codetr_ros.ros import messages, qos
 from codetr_ros.ros.link import Link
 from codetr_ros.runs import folder as run_folder
 from helpers import forked
 
-PATIENCE = 120.0  # [s] a busy machine starts five nodes in 40
+PATIENCE = 240.0  # [s] a busy machine starts five nodes in 40, and may stand still for 20
 PEER_DEADLINE = 2 * PATIENCE  # [s] a test gives up before others do on a node that it holds
 RUN_ID = 'run'
 NAMESPACE = f'/run_{RUN_ID}'
@@ -129,6 +129,17 @@ class Nodes:
             if resident := re.findall(r'VmRSS:\s+(\d+) kB', text):  # else it has just ended
                 found[node.name] = 1024 * int(resident[0])
         return found
+
+    def readers(self, kind: type) -> set[str]:
+        """Names of the nodes that run and read what is published of a kind of record."""
+        labelled = self.settings.labels_steps
+        return {
+            name
+            for name, code in self.codes().items()
+            if code is None
+            and name in self.names
+            and (kind is Presence or kind in read_by(self.role(name), labelled))
+        }
 
     def wait(self, *names: str) -> dict[str, int | None]:
         """Wait until nodes have ended, all of them if none is named; their exit codes."""
@@ -269,12 +280,13 @@ class Witness:
             publishers[kind] = self.link.node.create_publisher(
                 messages.message_type(kind), topic, qos.profile(topic)
             )
-        self.until(
-            lambda: all(
-                publisher.get_subscription_count() == len(self.readers(TOPICS[kind])) > 0
-                for kind, publisher in publishers.items()
-            )
-        )
+
+        def matched(kind: type) -> bool:
+            readers = self.readers(TOPICS[kind])
+            due = self._nodes.readers(kind) <= readers  # else one is not even discovered yet
+            return due and publishers[kind].get_subscription_count() == len(readers) > 0
+
+        self.until(lambda: all(map(matched, publishers)))
         for kind, data in said:
             publishers[kind].publish(data)
 

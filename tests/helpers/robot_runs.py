@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -141,14 +142,15 @@ class Person(nodes.Witness):
     def __enter__(self) -> 'Person':
         super().__enter__()
         self.commands: list[list[float]] = []
+        self.times: list[float] = []
         self.measurements = 0
         node = self.link.node
         node.create_subscription(JointState, '/joint_states', self._measured, QoSProfile(depth=10))
         node.create_subscription(
             Float64MultiArray,
             COMMANDS,
-            lambda message: self.link.store(self.commands.append, list(message.data)),
-            QoSProfile(depth=100),
+            lambda message: self.link.store(self._commanded, list(message.data), time.monotonic()),
+            QoSProfile(depth=10_000),  # as many as come while this process stands still
         )
         self.button = node.create_publisher(Bool, '/arm/emergency_stop', 1)
         return self
@@ -180,6 +182,10 @@ class Person(nodes.Witness):
         self.until(future.done)
         return future.result()
 
+    def _commanded(self, command: list[float], now: float) -> None:
+        self.commands.append(command)
+        self.times.append(now)
+
     def _measured(self, message: JointState) -> None:
         self.measurements += 1
 
@@ -194,6 +200,13 @@ class Person(nodes.Witness):
     def rests(self) -> bool:
         """Whether the last five commands were the safe one, and there are so many."""
         return len(self.commands) >= 5 and not any(any(c) for c in self.commands[-5:])
+
+    def took(self, count: int, least: float, most: float) -> bool:
+        """Whether the last commands came at a rate: so many further ones within so many seconds.
+        They do, sooner or later, also where this process or the robot's stands still now and then.
+        """
+        times = self.times[-count - 1 :]
+        return len(times) > count and least < times[-1] - times[0] < most
 
     def ticks(self, count: int) -> None:
         """Wait for so many further commands."""
