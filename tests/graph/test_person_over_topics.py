@@ -5,8 +5,10 @@ camera that publishes nothing is named.
 import pytest
 
 from codetr_ros.bags.verify import verify
+from helpers import slow_robots
 from helpers.judging import (
     CODETR,
+    PATIENCE,
     Command,
     first_waiting,
     judge_until_taken,
@@ -16,8 +18,9 @@ from helpers.judging import (
 from helpers.nodes import domain
 
 FLAGS = (
-    *('--scorer', 'person', '--scorers', 'ann', '--task', 'InvertedPendulum-v5'),
-    *('--delay', '10', '--steps', '3000', '--warmup-steps', '1000', '--phase-steps', '500'),
+    *('--scorer', 'person', '--scorers', 'ann', '--task', slow_robots.PENDULUM),
+    *('--delay', '10', '--steps', '2400', '--warmup-steps', '400', '--phase-steps', '100'),
+    *('--peer-deadline', str(PATIENCE)),
     *('--method', 'evidence', '--evaluate-every', '0', '--no-film', '--camera', '/a/camera'),
 )
 
@@ -25,10 +28,13 @@ FLAGS = (
 @pytest.mark.slow
 def test_what_a_person_states_on_the_page_is_taken_by_a_commit_and_learnt_from(tmp_path):
     out = tmp_path / 'run'
-    with domain(), Command((*CODETR, 'train', *FLAGS, '--out', str(out))) as train:
+    held = slow_robots.Held(tmp_path, 0.02)
+    words = (*CODETR, 'train', *FLAGS, '--out', str(out))
+    with domain(), Command(words, variables=held.variables) as train:
         url = train.until(r'score as ann at (http\S+)')[1]
         shown = pictures(url, first_waiting(url))
         taken = judge_until_taken(url)
+        held.let_go()  # before, the run could end while somebody only looks at the page
         code = train.end()
     assert code == 0, train.text
     assert taken, 'no commit took what was stated'

@@ -15,14 +15,15 @@ from rclpy.signals import SignalHandlerOptions
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.verify import verify
 from codetr_ros.records import CompositeReward
-from helpers.judging import CODETR, PATIENCE, Command, desk_of, held, judge, summary_of
+from helpers import slow_robots
+from helpers.judging import CODETR, PATIENCE, Command, desk_of, judge, summary_of
 from helpers.nodes import domain
 
 ROOT = Path(__file__).resolve().parents[2]
 SCORER = ROOT / 'examples' / 'scorer' / 'scorer.py'
 CALL = re.compile(r'ros2 service call \S+ codetr_msgs/srv/ScoreSegment\s+\\?\s*"(\{.*?\})"', re.S)
 FLAGS = (
-    *('--scorer', 'topic', '--task', 'Reacher-v5', '--delay', '25', '--score-service'),
+    *('--scorer', 'topic', '--task', slow_robots.REACHER, '--delay', '25', '--score-service'),
     *('--steps', '4000', '--warmup-steps', '1000', '--phase-steps', '500'),
     *('--method', 'evidence', '--evaluate-every', '0', '--no-film', '--sac.hidden', '32', '32'),
     *('--peer-deadline', str(PATIENCE)),
@@ -62,7 +63,9 @@ def shown_problem(url: str) -> str:
 @pytest.mark.slow
 def test_a_program_scores_by_service_and_a_page_without_the_key_takes_nothing(tmp_path):
     out = tmp_path / 'run'
-    with domain(), Command((*CODETR, 'train', *FLAGS, '--out', str(out))) as train:
+    held = slow_robots.Held(tmp_path, 0.02)
+    words = (*CODETR, 'train', *FLAGS, '--out', str(out))
+    with domain(), Command(words, held.variables) as train:
         found = train.until(r'scores by service: (\S+)/score_segment, token (\w+)')
         namespace, token = found[1], found[2]
         assert found[0] in train.text
@@ -71,24 +74,23 @@ def test_a_program_scores_by_service_and_a_page_without_the_key_takes_nothing(tm
             Command((*CODETR, 'score', namespace, '--name', 'ben')) as page,
             Command((*program, '-r', f'__ns:={namespace}')) as scorer,
         ):
-            with held(train, out):
-                scorer.until('scores what')
-                page.until("nothing that 'ben' states is taken")
-                url = page.until(r'score as ben at (http\S+)')[1]
-                problem = shown_problem(url)
-                assert 'has a key and this process has none' in problem
-                assert 'CODETR_RUN_KEY' in problem
-                with pytest.raises(urllib.error.HTTPError, match='422') as refused:
-                    judge(url, ['sim', 0, 0, 25], 3)
-                assert 'CODETR_RUN_KEY' in refused.value.read().decode()
+            scorer.until('scores what')
+            page.until("nothing that 'ben' states is taken")
+            url = page.until(r'score as ben at (http\S+)')[1]
+            problem = shown_problem(url)
+            assert 'has a key and this process has none' in problem
+            assert 'CODETR_RUN_KEY' in problem
+            with pytest.raises(urllib.error.HTTPError, match='422') as refused:
+                judge(url, ['sim', 0, 0, 25], 3)
+            assert 'CODETR_RUN_KEY' in refused.value.read().decode()
             scorer.until('published as number 0')
             requests = calls()
             assert requests, 'no call of the service is documented'
-            with held(train, out):
-                for fields in requests:
-                    answer = called(namespace, ScoreSegment.Request(**(fields | {'token': token})))
-                    assert answer.accepted or 'segment' in answer.message, answer.message
-                    assert not called(namespace, ScoreSegment.Request(**fields)).accepted
+            for fields in requests:
+                answer = called(namespace, ScoreSegment.Request(**(fields | {'token': token})))
+                assert answer.accepted or 'segment' in answer.message, answer.message
+                assert not called(namespace, ScoreSegment.Request(**fields)).accepted
+            held.let_go()  # before, the run could end meanwhile
             scored, left = scorer.end(), page.end()
         code = train.end()
     assert code == 0, train.text

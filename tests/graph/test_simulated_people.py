@@ -1,7 +1,5 @@
 """Simulated people, each with a scale of its own, and a person who joins them, over topics."""
 
-import os
-
 import numpy as np
 import pytest
 
@@ -11,13 +9,14 @@ from codetr_ros.cli import main
 from codetr_ros.nodes.signing import VARIABLE, new_key
 from codetr_ros.records import Commit, CompositeReward, ScoreRequest
 from codetr_ros.runs import reports
-from helpers.judging import CODETR, PATIENCE, Command, first_waiting, held, judge, summary_of
+from helpers import slow_robots
+from helpers.judging import CODETR, PATIENCE, Command, first_waiting, judge, summary_of
 from helpers.nodes import domain
 
 FLAGS = (
     *('--scorer', 'simulated', '--people.count', '2', '--people.late', '100'),
     *('--people.shared', '0.5', '--people.best', '-3', '--requests', '8'),
-    *('--task', 'Reacher-v5', '--delay', '25', '--method', 'evidence'),
+    *('--task', slow_robots.REACHER, '--delay', '25', '--method', 'evidence'),
     *('--steps', '4000', '--warmup-steps', '1000', '--phase-steps', '500'),
     *('--evaluate-every', '0', '--no-film', '--sac.hidden', '32', '32'),
     *('--peer-deadline', str(PATIENCE)),
@@ -37,17 +36,14 @@ def corrected(url: str) -> tuple:
 def a_run(tmp_path_factory):
     """A run whose key was handed over, and the segment that a person scored and corrected."""
     out = tmp_path_factory.mktemp('people') / 'run'
-    environment = os.environ | {VARIABLE: new_key()}
-    with (
-        domain(),
-        Command((*CODETR, 'train', *FLAGS, '--out', str(out)), environment) as train,
-    ):
+    key, held = {VARIABLE: new_key()}, slow_robots.Held(out.parent, 0.02)
+    words = (*CODETR, 'train', *FLAGS, '--out', str(out))
+    with domain(), Command(words, key | held.variables) as train:
         namespace = train.until(r'namespace: (\S+)')[1]
-        # the page finds the domain of the test in the variables of this process
-        with Command((*CODETR, 'score', namespace, '--name', 'ann'), environment) as page:
-            with held(train, out):
-                url = page.until(r'score as ann at (http\S+)')[1]
+        with Command((*CODETR, 'score', namespace, '--name', 'ann'), key) as page:
+            url = page.until(r'score as ann at (http\S+)')[1]
             segment = corrected(url)
+            held.let_go()  # before, the run could end while the page opens
             assert page.end() == 0, page.text
         assert train.end() == 0, train.text
     return out, segment

@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 import urllib.request
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -25,12 +25,12 @@ class Command:
 
     Args:
         words: the command.
-        environment: its variables; None: those of this process.
+        variables: of its environment, beside those of this process when it is entered.
     """
 
-    def __init__(self, words: Sequence[str], environment: dict[str, str] | None = None) -> None:
+    def __init__(self, words: Sequence[str], variables: Mapping[str, str] | None = None) -> None:
         self._words = words
-        self._environment = dict(os.environ) if environment is None else environment
+        self._variables = dict(variables or {})
         self.lines: list[str] = []
         self._more = threading.Condition()
 
@@ -40,7 +40,7 @@ class Command:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            env=self._environment | {'PYTHONUNBUFFERED': '1'},
+            env={**os.environ, 'PYTHONUNBUFFERED': '1', **self._variables},
         )
         self._reader = threading.Thread(target=self._read)
         self._reader.start()
