@@ -5,7 +5,13 @@ from pathlib import Path
 import pytest
 
 from codetr_ros.processes.launcher import Processes
-from codetr_ros.processes.supervise import Interrupts, Silence, supervise, why_it_gave_up
+from codetr_ros.processes.supervise import (
+    Interrupts,
+    Silence,
+    failed_at,
+    supervise,
+    why_it_gave_up,
+)
 from codetr_ros.records import Commit
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import reports
@@ -13,6 +19,7 @@ from codetr_ros.runs.reports import NodeReport
 from helpers.builders import presence
 from helpers.programs import (
     ENDS_WHEN_ASKED,
+    PATIENCE,
     READY,
     WAIT,
     Said,
@@ -58,6 +65,40 @@ def test_a_process_that_dies_stops_the_whole_run_and_is_named(
     assert said == [f'{reason}: stopping sim']
     assert processes.running() == []
     assert [n.name for n in processes.nodes if n.unasked_failure] == ['learner']
+
+
+def test_of_several_that_have_failed_meanwhile_the_first_is_named(
+    tmp_path: Path, processes: Processes
+) -> None:
+    end = 'raise SystemExit(1)'
+    start(processes, tmp_path, *(python(name, end) for name in ('sim', 'record', 'learner')))
+    for node in processes.nodes:
+        node.process.wait(PATIENCE)
+    for name, at in (('sim', 2000.0), ('record', 1000.0), ('learner', 3000.0)):
+        path = run_folder.report_path(tmp_path, name, name)
+        reports.write(path, NodeReport(role=name, name=name, error='it waited for another'))
+        os.utime(path, (at, at))
+
+    failure = supervise(
+        processes,
+        poll(processes),
+        Interrupts(),
+        Silence(),
+        failed_at=lambda node: failed_at(node, tmp_path),
+    )
+
+    assert failure == 'record ended with exit code 1'
+
+
+def test_who_was_killed_and_left_no_report_has_failed_before_those_that_gave_up_on_it(
+    tmp_path: Path, processes: Processes
+) -> None:
+    start(processes, tmp_path, python('sim', ''), python('learner', ''))
+    killed, gave_up = processes.nodes
+    report = NodeReport(role='learner', name='learner', error='it waited for another')
+    reports.write(run_folder.report_path(tmp_path, 'learner', 'learner'), report)
+
+    assert failed_at(killed, tmp_path) < failed_at(gave_up, tmp_path)
 
 
 def test_a_process_that_ends_well_but_too_early_stops_the_run(

@@ -19,6 +19,7 @@ from codetr_ros.processes.restarts import Restarts, may_be_started_again
 from codetr_ros.processes.supervise import (
     Interrupts,
     Silence,
+    failed_at,
     is_over,
     supervise,
     why_it_gave_up,
@@ -134,6 +135,7 @@ def run(
                     restarts=topics.restarts,
                     over=lambda node: is_over(node, folder),
                     dispensable=lambda node: _can_do_without(node, summary, folder),
+                    failed_at=lambda node: failed_at(node, folder),
                 )
                 watching.poll(0.0)  # the last messages of the last node
         except LaunchError as error:

@@ -2,7 +2,7 @@
 
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any
@@ -88,6 +88,7 @@ def supervise(
     restarts: Restarts | None = None,
     over: Callable[[Node], bool] = lambda node: False,
     dispensable: Callable[[Node], bool] = lambda node: False,
+    failed_at: Callable[[Node], float] = lambda node: 0.0,
 ) -> str | None:
     """Watch until every process has ended; start those again that were killed, and end all of them
     if one fails or the user asks.
@@ -105,6 +106,7 @@ def supervise(
         over: for a node that was killed: whether it had done all that the run needs of it.
         dispensable: whether the run goes on and ends well without a node that fails for good, or
             that does not end.
+        failed_at: when a node has failed [s]: of several that have meanwhile, the first is named.
 
     Returns:
         Why the run failed; None if it finished or was interrupted.
@@ -117,7 +119,8 @@ def supervise(
             processes.log('stopping: nodes end their slice and save (Ctrl-C again to hurry)')
             processes.stop()
             return _after_stop(processes)
-        failed = _start_again(processes, restarts, over, dispensable, silence)
+        fallen = sorted((n for n in processes.nodes if n.unasked_failure), key=failed_at)
+        failed = _start_again(processes, fallen, restarts, over, dispensable, silence)
         if failed is not None:
             died = failed.how_it_ended() + restarts.exhausted(failed.name, failed.code)
             return _stop_all(processes, died)
@@ -150,6 +153,7 @@ def _excuse(processes: Processes, node: Node, reason: str) -> None:
 
 def _start_again(
     processes: Processes,
+    fallen: Sequence[Node],
     restarts: Restarts,
     over: Callable[[Node], bool],
     dispensable: Callable[[Node], bool],
@@ -157,12 +161,8 @@ def _start_again(
 ) -> Node | None:
     """Start the nodes again that were killed and may be; the first that failed for good and is
     needed, if any.
-
-    Each node is looked at once: of two that are killed together the second may die meanwhile.
     """
-    for node in processes.nodes:
-        if not node.unasked_failure:
-            continue
+    for node in fallen:
         if over(node):
             node.excused = True
         elif restarts.permit(node.name, node.code):
@@ -202,6 +202,15 @@ def is_over(node: Node, folder: Path) -> bool:
     return reports.has_finished(folder, node.role, node.name) and reports.has_finished(
         folder, 'record'
     )
+
+
+def failed_at(node: Node, folder: Path) -> float:
+    """When a node has failed [s, since the epoch], by its report; 0 for one that was killed and
+    has left none. Others give up because of the first, and some of them may have ended too when
+    somebody looks.
+    """
+    path = run_folder.report_path(folder, node.role, node.name)
+    return path.stat().st_mtime if path.is_file() else 0.0
 
 
 def why_it_gave_up(node: Node, folder: Path) -> str | None:
