@@ -15,7 +15,7 @@ from codetr_ros.cores import in_process
 from codetr_ros.offline.replay import replay
 from codetr_ros.runs.summary import Summary
 from helpers.builders import tiny
-from helpers.runs import train
+from helpers.runs import asked_again, train
 
 # Episodes of the pendulum end early and at any step; those of the reacher at 50. Segments of 7
 # steps fit into neither a phase of 200 steps nor an episode of 50.
@@ -143,11 +143,12 @@ def test_a_learner_of_scores_ends_with_the_same_weights_without_a_reward_node(
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)  # an empty cache costs half a minute of computing, twice
+@pytest.mark.timeout(900)  # an empty cache costs half a minute of computing, twice
 def test_compiled_updates_are_the_same_in_another_process(tmp_path):
     settings = tiny(sac__compile=True)
     calls = by_calls(settings)  # first: the node then finds in the cache what it needs
-    topics, _ = train(settings, tmp_path / 'topics', installed=True)
+    # a learner that compiles all the same publishes nothing meanwhile
+    topics, _ = train(settings, tmp_path / 'topics', '--peer-deadline', '300', installed=True)
     check_same(topics, calls)
 
 
@@ -193,7 +194,8 @@ def test_irregular_missing_and_noisy_scores_are_the_same_over_topics_and_in_proc
     topics, _ = train(settings, tmp_path / 'topics')
     calls = by_calls(settings)
     check_same(topics, calls)
-    assert topics['lost'] == topics['duplicated'] == topics['refused'] == 0
+    assert topics['lost'] == topics['refused'] == 0
+    assert topics['duplicated'] == 0 or asked_again(tmp_path / 'topics')
     for name in settings.simulator_names:
         counters = topics['counters'][f'sim-{name}']
         assert 0 < counters['scores missing'] < counters['scores'] / 2
@@ -214,7 +216,8 @@ def test_several_environments_of_a_simulator_over_topics_equal_those_in_process(
     settings = tiny(simulators=2, envs=2, overlap=True)
     topics, _ = train(settings, tmp_path / 'topics')
     check_same(topics, by_calls(settings))
-    assert topics['lost'] == topics['duplicated'] == topics['refused'] == 0
+    assert topics['lost'] == topics['refused'] == 0
+    assert topics['duplicated'] == 0 or asked_again(tmp_path / 'topics')
     steps = [topics['counters'][f'sim-{name}']['steps'] for name in settings.simulator_names]
     assert steps == [600, 600]
     bag = verify(Path(topics['bag']))

@@ -7,7 +7,7 @@ import subprocess
 
 import pytest
 
-from helpers.runs import CODETR
+from helpers.runs import CODETR, DEADLINE
 
 REFUSED = {
     'an unknown task': (
@@ -69,7 +69,7 @@ def refusals(tmp_path_factory):
         tried[case] = started, place
     ended = {}
     for case, (started, place) in tried.items():
-        out, complaint = started.communicate(timeout=120)
+        out, complaint = started.communicate(timeout=DEADLINE)
         ended[case] = started.returncode, out, complaint, place
     return ended
 

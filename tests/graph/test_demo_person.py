@@ -7,7 +7,7 @@ import pytest
 from codetr_ros.bags.reader import Bag
 from codetr_ros.bags.verify import verify
 from codetr_ros.records import CompositeReward, ScoreRequest
-from helpers.judging import CODETR, Command, desk_of, summary_of
+from helpers.judging import CODETR, Command, desk_of, held, summary_of
 from helpers.nodes import domain
 
 
@@ -18,9 +18,10 @@ def test_the_demo_serves_both_pages_and_ends_by_itself_with_who_taught(tmp_path)
     with domain(), Command(words) as demo:
         score = demo.until(r'score as you at (http\S+)')[1]
         watch = demo.until(r'watch \S+ at (http\S+)')[1]
-        assert desk_of(score)['scorer'] == 'you'
-        with urllib.request.urlopen(watch, timeout=60) as page:
-            assert b'<h1' in page.read()
+        with held(demo, out):
+            assert desk_of(score)['scorer'] == 'you'
+            with urllib.request.urlopen(watch, timeout=60) as page:
+                assert b'<h1' in page.read()
         code = demo.end()
     assert code == 0, demo.text
     records = [entry.record for entry in Bag(out / 'bag').entries()]

@@ -80,6 +80,16 @@ def logs(folder: Path) -> str:
     return '\n'.join(f'--- {path.name}\n{path.read_text()[-2000:]}' for path in found)
 
 
+def asked_again(folder: Path) -> list[str]:
+    """What the nodes of a run have logged of messages that they sent again on request. Nobody asks
+    for any in an undisturbed run; a node that the machine lets stand still does, and counts as
+    duplicated what it had.
+    """
+    found = (folder / 'logs').glob('*.log')
+    lines = (line for path in found for line in path.read_text().splitlines())
+    return [line for line in lines if 'sending it again' in line]
+
+
 def until(found: Callable[[], Any], command: Command, folder: Path) -> Any:
     """Wait until `found()` is true, as long as a command runs; what it returns."""
     end = time.monotonic() + DEADLINE
