@@ -128,7 +128,8 @@ def check(bag: dict[str, list[bytes]], listener: Listener) -> None:
             assert first < last
             for sequence in range(last + 1):
                 assert (name, sequence) in there
-                assert sequence < first or there[name, sequence] == heard[name, sequence]
+                # who listens and is slow misses some
+                assert heard.get((name, sequence), there[name, sequence]) == there[name, sequence]
 
 
 def number(kind: type, who: str, raw: bytes) -> tuple[str, int]:

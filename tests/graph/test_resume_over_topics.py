@@ -20,12 +20,27 @@ from codetr_ros.nodes.outbox import KEPT_PHASES
 from codetr_ros.offline.replay import replay
 from codetr_ros.runs import origin
 from codetr_ros.runs.checkpoints import DESCRIPTION
+from helpers import slow_robots
 from helpers.builders import tiny
 from helpers.forked import codetr
 from helpers.runs import finish, node_of, start, until, write
 
-ENVIRONMENT = os.environ | {'COLUMNS': '160'}
-SETTINGS = tiny(steps=1600, threads=1, evaluate_every=400)
+SETTINGS = tiny(steps=1600, threads=1, evaluate_every=400, task=slow_robots.POINT)
+
+
+@pytest.fixture
+def held(tmp_path, monkeypatch):
+    """Returns a function that lets the robots of a run be slow: it must not be over when it is
+    killed.
+    """
+
+    def hold(seconds, after=0):
+        made = slow_robots.Held(tmp_path, seconds, after)
+        for name, value in made.variables.items():
+            monkeypatch.setenv(name, value)
+        return made
+
+    return hold
 
 
 def digests(settings):
@@ -41,26 +56,29 @@ def weights(summary):
 def resumed(folder: Path, *flags: str):
     """Go on with a run to its end; its summary."""
     flags = ('--resume', str(folder), '--no-film', *flags)
-    return finish(codetr('train', *flags, environment=ENVIRONMENT), folder)[0]
+    return finish(codetr('train', *flags, environment=dict(os.environ)), folder)[0]
 
 
 def kill(command, folder: Path) -> None:
     """Kill all processes of a run at once."""
     nodes = [node_of(folder, path.stem) for path in (folder / 'logs').glob('*.log')]
-    for number in (command.pid, *nodes):
-        os.kill(number, signal.SIGKILL)
+    for number in (signal.SIGSTOP, signal.SIGKILL):  # nobody notices that another is dead
+        for process in (command.pid, *nodes):
+            os.kill(process, number)
     command.communicate()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize('overlap', [False, True], ids=['lock-step', 'overlap'])
 def test_a_run_all_of_which_is_killed_goes_on_and_gets_longer_and_has_the_same_weights(
-    tmp_path, overlap
+    tmp_path, overlap, held
 ):
     settings, folder = SETTINGS.changed({'overlap': overlap}), tmp_path / 'run'
+    robot = held(seconds=1.0, after=4 * settings.phase_steps)
     command = start(write(settings, folder), folder)
     until(lambda: phase_of(folder) >= 3, command, folder)
     kill(command, folder)
+    robot.let_go()
     summary = resumed(folder)
     assert weights(summary) == digests(settings)
     assert len(origin.read(folder).resumed) == 1
@@ -79,19 +97,21 @@ def test_a_run_all_of_which_is_killed_goes_on_and_gets_longer_and_has_the_same_w
 
 
 @pytest.mark.slow
-def test_a_run_is_gone_on_with_where_its_learner_was_ahead_of_the_recorder(tmp_path):
+def test_a_run_is_gone_on_with_where_its_learner_was_ahead_of_the_recorder(tmp_path, held):
     """It has learnt from the newest commit; the recorder has not received the permission before
     the newest one.
     """
     settings = SETTINGS.changed(
         {'overlap': True, 'steps': 4000, 'phase_steps': 100, 'evaluate_every': 0}
     )
-    folder = tmp_path / 'run'
+    folder, robot = tmp_path / 'run', held(seconds=1.0, after=4 * settings.phase_steps)
     command = start(write(settings, folder), folder)
     until(lambda: phase_of(folder) >= 3, command, folder)
     log, learner = folder / 'logs' / 'record.log', node_of(folder, 'learner')
     os.kill(learner, signal.SIGSTOP)
-    until(lambda: 'waits for permission' in log.read_text(), command, folder)
+    before = len(log.read_text())
+    robot.let_go()
+    until(lambda: 'waits for permission' in log.read_text()[before:], command, folder)
     os.kill(node_of(folder, 'record'), signal.SIGSTOP)
     os.kill(learner, signal.SIGCONT)
     learnt = folder / 'checkpoints' / f'learner-{phase_of(folder) - 1:06}' / DESCRIPTION
@@ -103,12 +123,12 @@ def test_a_run_is_gone_on_with_where_its_learner_was_ahead_of_the_recorder(tmp_p
 
 
 @pytest.mark.slow
-def test_a_run_from_which_a_simulator_was_left_out_goes_on_and_gets_longer(tmp_path):
+def test_a_run_from_which_a_simulator_was_left_out_goes_on_and_gets_longer(tmp_path, held):
     """Its weights are those that learn again from what was recorded."""
     changes = {
         'overlap': True, 'simulators': 2, 'steps': 4000, 'phase_steps': 100, 'evaluate_every': 0,
     }  # fmt: skip
-    folder = tmp_path / 'run'
+    folder, robots = tmp_path / 'run', held(seconds=0.02)
     command = start(write(SETTINGS.changed(changes), folder), folder, '--leave-out-after', '2')
     until(lambda: phase_of(folder) >= 3, command, folder)
     os.kill(node_of(folder, 'sim_2'), signal.SIGSTOP)
@@ -116,6 +136,7 @@ def test_a_run_from_which_a_simulator_was_left_out_goes_on_and_gets_longer(tmp_p
     (phase,) = until(lambda: re.findall(out, log.read_text())[:1], command, folder)
     until(lambda: phase_of(folder) > int(phase), command, folder)  # that is in the bag
     kill(command, folder)
+    robots.let_go()
     for steps in (4000, 4500):
         summary = resumed(folder, '--steps', str(steps))
         assert summary['steps'] == steps
@@ -131,15 +152,17 @@ def test_a_run_from_which_a_simulator_was_left_out_goes_on_and_gets_longer(tmp_p
 
 
 @pytest.mark.slow
-def test_a_run_without_checkpoints_is_learnt_again_from_its_bag(tmp_path):
+def test_a_run_without_checkpoints_is_learnt_again_from_its_bag(tmp_path, held):
     """By both sides at once, over more phases than the reward node keeps labels of."""
     settings = SETTINGS.changed(
         {'overlap': True, 'steps': 2400, 'phase_steps': 100, 'evaluate_every': 0}
     )
-    folder = tmp_path / 'run'
+    phases = settings.warmup_phases + KEPT_PHASES + 5
+    folder, robot = tmp_path / 'run', held(seconds=1.0, after=phases * settings.phase_steps)
     command = start(write(settings, folder), folder)
-    until(lambda: phase_of(folder) > settings.warmup_phases + KEPT_PHASES + 3, command, folder)
+    until(lambda: phase_of(folder) >= phases - 1, command, folder)
     kill(command, folder)
+    robot.let_go()
     shutil.rmtree(folder / 'checkpoints')
     summary = resumed(folder)
     assert weights(summary) == digests(settings)

@@ -15,7 +15,7 @@ MODULE = __name__
 POINT, REACHER, PENDULUM = (
     f'{MODULE}:{name}-v0' for name in ('SlowPoint', 'SlowReacher', 'SlowPendulum')
 )
-LET_GO, SECONDS = 'CODETR_TEST_LET_GO', 'CODETR_TEST_STEP_SECONDS'
+LET_GO, SECONDS, AFTER = (f'CODETR_TEST_{name}' for name in ('LET_GO', 'SECONDS', 'AFTER'))
 
 
 class Held:
@@ -27,12 +27,18 @@ class Held:
     Args:
         folder: takes a file.
         seconds: that each step takes.
+        after: steps of a process that are as quick as they can be, before these.
     """
 
-    def __init__(self, folder: Path, seconds: float) -> None:
+    def __init__(self, folder: Path, seconds: float, after: int = 0) -> None:
         self._file = folder / 'let_go'
         path = os.pathsep.join(filter(None, [str(TESTS), os.environ.get('PYTHONPATH', '')]))
-        self.variables = {'PYTHONPATH': path, LET_GO: str(self._file), SECONDS: str(seconds)}
+        self.variables = {
+            'PYTHONPATH': path,
+            LET_GO: str(self._file),
+            SECONDS: str(seconds),
+            AFTER: str(after),
+        }
 
     def let_go(self) -> None:
         """Let them be as quick as they can from now on."""
@@ -45,9 +51,12 @@ TESTS = Path(__file__).resolve().parents[1]
 class Slow(gymnasium.Wrapper):
     """An environment that is slow as long as a file does not exist."""
 
+    steps = 0  # of all of them in this process
+
     def step(self, action: Any) -> Any:
+        Slow.steps += 1
         file = os.environ.get(LET_GO)
-        if file and not os.path.exists(file):
+        if file and Slow.steps > int(os.environ[AFTER]) and not os.path.exists(file):
             time.sleep(float(os.environ[SECONDS]))
         return super().step(action)
 
