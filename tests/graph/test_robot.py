@@ -34,6 +34,7 @@ def test_a_run_on_a_robot_ends_by_itself_and_records_what_was_commanded(tmp_path
             run.begin()
             person.until(lambda: 'is not moved before' in run.log('robot'))
             person.until(person.sees_commands)  # before the first goes out
+            person.until(lambda: 'inspection' in person.readers('transitions'))
             person.activate()
             person.until(lambda: person.committed(2))
             commands = np.array(person.commands)
@@ -111,6 +112,5 @@ def test_stopped_by_a_signal_it_leaves_the_robot_with_the_safe_command(tmp_path)
             person.until(person.moves)
             run.end('robot', signal.SIGTERM)
             person.until(lambda: run.codes()['robot'] is not None)
-            person.link.handle(0.2)
-            assert not any(person.commands[-1])
+            person.until(lambda: not any(person.commands[-1]))  # and nobody sends another one
         assert run.codes()['robot'] == 0

@@ -128,7 +128,8 @@ def test_nothing_that_was_published_is_lost_or_refused_by_the_run(run, person):
         bad = {k: n for k, n in counters.items() if k.split()[0] in ('lost', 'refused')}
         assert not bad, (name, bad)
     sequences = [chunk.sequence for chunk in person.chunks]
-    assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
+    # a test that is kept from listening misses some
+    assert all(later > earlier for earlier, later in pairwise(sequences))
 
 
 def test_the_policy_sees_the_joints_and_nothing_else(person):
@@ -214,7 +215,7 @@ def test_scores_of_the_robots_own_topic_come_late_or_never_and_join_a_later_comm
     own = {(s.episode, s.first_step) for s in person.scores if s.scorer == 'robot'}
     everything = {(chunk.episode, chunk.first_step // 20 * 20) for chunk in person.chunks[:-10]}
     assert own and everything - own  # the camera has missed some
-    assert {s.scorer for s in person.scores} == {'robot', 'inspection'}
+    person.until(lambda: {s.scorer for s in person.scores} == {'robot', 'inspection'})
     best = [s.value for s in person.scores if s.scorer == 'robot']
     assert min(best) > 0 and max(best) <= 20
 
@@ -225,7 +226,9 @@ def test_lifecycle_services_do_what_they_are_called(person):
     assert not person.change('activate')  # it is, and the answer comes
     assert person.change('deactivate')
     assert person.state() == State.PRIMARY_STATE_INACTIVE
-    assert not any(person.commands[-1])  # the safe command
+    person.until(lambda: not any(person.commands[-1]))  # the safe command
+    seen = person.measurements
+    person.until(lambda: person.measurements > seen + 5)  # what was under way has arrived
     count = len(person.commands)
     seen = person.measurements
     person.until(lambda: person.measurements > seen + 20)

@@ -89,7 +89,8 @@ def test_rate_watchdogs_and_deadlines_are_of_the_simulated_time(tmp_path):
         assert {run.codes()[name] for name in ROLES} == {0}
         counters = run.report('robot')['counters']
         assert counters.get('control deadlines missed', 0) == 0
-        assert counters['episodes cut by clock'] == 1
+        # it stands still as well where the test does
+        assert counters['episodes cut by clock'] >= 1
 
 
 def waits(person: Person) -> str:

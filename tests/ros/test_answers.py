@@ -84,7 +84,7 @@ def test_a_false_answer_is_refused_and_the_true_one_awaited(links):
     serve_outbox(sim, 'run', outbox)
     question = Asker(asker, '/r/sim/fetch_phase', 'run')
     asker.handle(0.05)
-    end, wanted = time.monotonic() + 60.0, 0
+    end, wanted = time.monotonic() + 150.0, 0
     while not refused and time.monotonic() < end:
         if question.ready and not question.busy:
             wanted += 1

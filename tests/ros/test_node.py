@@ -24,7 +24,7 @@ from helpers.playing import NAMESPACE, PATIENCE, everybody_matched, one_phase, o
 
 def test_a_recorder_commits_a_phase_and_keeps_every_byte_of_it(play, tmp_path):
     play = play()
-    with process('record', f'folder:={tmp_path}', 'peer_deadline:=30.0') as node:
+    with process('record', f'folder:={tmp_path}', 'peer_deadline:=180.0') as node:
         play.until(lambda: everybody_matched(play), node)
         commit = one_phase(play)
         assert (commit.phase, list(commit.sources), list(commit.transitions)) == (0, ['sim'], [0])
@@ -134,7 +134,15 @@ def test_what_must_be_refused_is_counted_and_changes_nothing(play, tmp_path):
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM], ids=lambda s: s.name)
 def test_a_signal_ends_a_waiting_node_at_once_without_traceback(play, number):
-    play = play(roles=())
+    play(roles=())
+    took = [ended_by(number)]
+    while min(took) >= 3.0 and len(took) < 3:  # the machine may have held it
+        took.append(ended_by(number))
+    assert min(took) < 3.0  # the interpreter's own end included
+
+
+def ended_by(number):
+    """Seconds in which a signal ends a node that waits."""
     watched = []
     with Watcher(watched.append, NAMESPACE) as watcher, process('record') as node:
         end = time.monotonic() + PATIENCE
@@ -147,12 +155,13 @@ def test_a_signal_ends_a_waiting_node_at_once_without_traceback(play, number):
         node.send_signal(number)  # a second one changes nothing
         said = output(node)
         seconds = time.monotonic() - began
-        watcher.poll(0.5)
+        while not watched[-1].finished and time.monotonic() < end:
+            watcher.poll(0.1)
     assert node.returncode == 0, said
     assert 'Traceback' not in said
     assert f'stopped by {number.name}' in said
-    assert seconds < 3.0  # the interpreter's own end included, on a busy machine
     assert watched[-1].finished
+    return seconds
 
 
 def test_a_node_without_a_learner_names_it_and_gives_up(ros_domain):

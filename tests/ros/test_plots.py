@@ -16,7 +16,7 @@ from helpers.builders import tiny
 from helpers.layout import layout, plotted
 from helpers.summaries import episode
 
-DEADLINE = 30.0  # [s]
+DEADLINE = 120.0  # [s]
 
 
 @pytest.fixture

@@ -34,7 +34,7 @@ from helpers.playing import output, process
 
 def refusal(*parameters, role='learner'):
     """What a node says that refuses these parameters."""
-    with process(role, 'peer_deadline:=20.0', *parameters) as node:
+    with process(role, 'peer_deadline:=180.0', *parameters) as node:
         said = output(node)
     assert node.returncode == 1, said
     assert 'Traceback' not in said
