@@ -143,6 +143,31 @@ def test_it_ends_when_all_steps_are_taken_and_nothing_more_is_permitted():
     assert bench.robot.finished and bench.sent[-1] == [0.0, 0.0]
 
 
+def test_it_awaits_the_policy_without_which_it_takes_no_further_step():
+    bench = Bench(steps=8, warmup_steps=8)
+    assert bench.robot.unpermitted == 0
+    bench.permit(0)
+    assert bench.robot.unpermitted is None
+    bench.step(6)
+    assert bench.robot.unpermitted == 1
+    bench.permit(1)
+    bench.step(6)
+    assert bench.robot.unpermitted == bench.settings.phases == 2  # which permits nothing more
+    bench.robot.receive(policy(sources=('robot',), steps=np.array([0], np.uint32), phase=2))
+    assert bench.robot.unpermitted is None
+
+
+def test_at_its_free_pace_it_awaits_a_newer_policy_only_when_it_is_held_without():
+    bench = Bench(pace='free')
+    assert bench.robot.unpermitted == 0
+    bench.permit(3)  # of those before none is needed any more
+    bench.step(4)
+    assert bench.robot.unpermitted is None
+    bench.step(4 * 11 + 10)
+    assert 'the learner is 8 phases behind' in bench.robot.waiting_for()
+    assert bench.robot.unpermitted == 4
+
+
 def test_what_is_recorded_is_what_was_sent():
     bench = Bench({'limits': {'change': 5.0}}, pace='free')
     bench.permit(0)

@@ -89,6 +89,24 @@ def test_a_policy_that_the_learner_keeps_no_more_is_asked_of_the_recorder(fetche
     assert taken == [Policy]
 
 
+def test_what_is_answered_to_be_still_to_come_was_not_asked_for_in_vain(fetcher):
+    made, asked, _, now = fetcher
+    assert made.asked_for == {}
+    made.check(Waits())
+    assert made.asked_for == {'policy': 0.0}
+    now[0] = AFTER
+    made.check(Waits())  # neither the learner nor the recorder has it
+    assert made.asked_for == {'policy': AFTER}
+    asked['/learner/fetch_phase'].ready = False
+    now[0] = AFTER + AGAIN
+    made.check(Waits())
+    assert made.asked_for == {'policy': AFTER}
+    core = Waits()
+    core.unpermitted = None
+    made.check(core)
+    assert made.asked_for == {}
+
+
 def test_nobody_is_asked_by_a_core_that_waits_for_no_policy(fetcher):
     made, asked, _, now = fetcher
     core = Waits()

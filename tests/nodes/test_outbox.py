@@ -41,3 +41,13 @@ def test_nobody_waits_for_readers_of_anything_but_labels():
     list(outbox.read(1))
     list(outbox.read(1, [LABELS, 'codetr_msgs/msg/Metrics']))
     assert outbox.owes, 'the recorder asks for all that was published'
+
+
+def test_of_a_phase_between_others_there_may_be_nothing():
+    """An evaluator has results of some policies only; who asks back from the newest goes on."""
+    outbox = Outbox(phase_steps=5, phases=None)
+    for phase in (0, 4):
+        outbox.keep(transitions(phase=phase), stamp=phase)
+    assert [len(list(outbox.read(phase))) for phase in range(5)] == [1, 0, 0, 0, 1]
+    with pytest.raises(KeyError, match='nothing of phase 5 is kept; of these is: 0, 4'):
+        outbox.read(5)

@@ -223,7 +223,7 @@ def test_a_node_gives_up_on_what_was_lost_for_good_naming_topic_and_count(play):
 )
 def test_waiting_is_not_pointless_as_long_as(member, waiting, deadline, lost):
     member.values['peer_deadline'] = deadline
-    member.patience(['commits']).check(1e6, waiting, 'waits', lost)
+    member.patience(['commits']).check(1e6, waiting, 'waits', lost, {})
 
 
 REFUSED = (9,)

@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 
 from codetr_ros.simtest.disks import Trouble
+from codetr_ros.simtest.losing import losing
 from codetr_ros.simtest.network import Weather
 from codetr_ros.simtest.plan import DEADLINE, all_settings, plan
 from codetr_ros.simtest.process import Pace
@@ -17,6 +18,10 @@ from codetr_ros.simtest.run import carry_out, simulate
 QUICK, MANY = range(24), range(24, 120)
 FOUND = (43, 247, 475, 583, 792, 821, 50070, 50636)
 """Seeds beyond those that once failed."""
+LOSING = (110, 128, 136, 176, 213, 217, 219, 260)
+"""Likewise, where much is lost and nodes are killed: a node gave up on what it did not need or on
+what was lost only now, or waited until a recorder had asked all others.
+"""
 
 
 def failures(seeds):
@@ -29,6 +34,10 @@ def test_a_few_seeds_end_as_if_nothing_had_happened_or_by_name():
 
 def test_seeds_that_once_failed_end_as_if_nothing_had_happened_or_by_name():
     assert failures(FOUND) == {}
+
+
+def test_where_a_fifth_of_all_is_lost_and_nodes_are_killed_nobody_waits_in_vain():
+    assert {seed: found for seed in LOSING if (found := carry_out(losing(seed)).failures)} == {}
 
 
 def test_no_loss_is_hidden_where_many_messages_never_reach_the_recorder():

@@ -244,9 +244,38 @@ class Robot(Part):
         if self._settings.free:
             self._now = self._newest
         else:
-            phase = self._log.phase + (self._log.left <= 0)
+            phase = self._next_phase
             self._permitted = {k: each for k, each in self._permitted.items() if k >= phase - 1}
             self._now = self._permitted.get(phase)
+
+    @property
+    def _next_phase(self) -> int:
+        """The phase that the next step belongs to."""
+        return self._log.phase + (self._log.left <= 0)
+
+    @property
+    def _behind(self) -> bool:
+        """Whether a robot at its free pace must wait for a newer policy than the newest."""
+        log, settings = self._log, self._settings
+        assert self._newest is not None
+        learnt = max(self._newest[0].version, INITIAL_VERSION)
+        return log.total // settings.phase_steps > learnt + settings.ahead
+
+    @property
+    def unpermitted(self) -> int | None:
+        """The phase whose policy is awaited, without which no further step is taken; once all
+        are, that of the policy which permits nothing more. None if none is awaited.
+        """
+        settings = self._settings
+        if self.finished or not self.senses.size:
+            return None
+        if self._log.total >= settings.steps:
+            return settings.phases if self._last is None else None
+        if not settings.free:
+            return None if self._next_phase in self._permitted else self._next_phase
+        if self._newest is None:
+            return 0
+        return self._newest[0].phase + 1 if self._behind else None
 
     # ---- for the control
 
@@ -258,14 +287,12 @@ class Robot(Part):
             return Hold(FINISHED, 'all steps of the run are taken')
         if self._now is None:
             return Hold(PERMISSION, 'no policy permits a step')
-        if settings.free:
-            learnt = self._now[0].version
-            if log.total // settings.phase_steps > max(learnt, INITIAL_VERSION) + settings.ahead:
-                return Hold(
-                    BEHIND,
-                    f'the learner is {settings.ahead} phases behind: its newest policy has learnt '
-                    f'from phase {learnt}',
-                )
+        if settings.free and self._behind:
+            return Hold(
+                BEHIND,
+                f'the learner is {settings.ahead} phases behind: its newest policy has learnt '
+                f'from phase {self._now[0].version}',
+            )
         return None
 
     def act(self, observation: F32, step: int) -> F32:

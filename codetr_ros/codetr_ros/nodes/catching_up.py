@@ -72,7 +72,7 @@ class Fetcher:
         self._phases, self._labels, self._commits = Fetching(), Fetching(), Fetching()
         self._tasks, self._permissions = Fetching(), Fetching()
         self._offered, self._committed, self._permitted = Offered(), Offered(), Offered()
-        self._kinds: tuple[type, ...] = ()  # that the core takes in
+        self._kinds: tuple[type, ...] = ()  # of them, those that the core takes in
         self._fetched: Callable[[int], None]  # lets the core know that a phase was sent again
         self.behind = -1
 
@@ -95,10 +95,11 @@ class Fetcher:
         """Ask for what the core has lacked for a while."""
         now = self._clock()
         missing, unlabelled = core.missing, core.unlabelled
+        self._kinds = tuple(kind for kind in OF_PHASES if kind in core.subscribes)
         known = missing is not None and (missing <= self.behind or missing in core.gone_by)
         if self._phases.due(missing, now, known):
             assert missing is not None
-            self._kinds, self._fetched = core.subscribes, core.fetched
+            self._fetched = core.fetched
             self._ask_recorder(missing)
         uncommitted = core.uncommitted
         if self._commits.due(uncommitted, now):
@@ -114,6 +115,24 @@ class Fetcher:
         if self._labels.due(unlabelled, now, behind):
             assert unlabelled is not None
             self._ask_reward(unlabelled)
+
+    @property
+    def asked_for(self) -> dict[str, float]:
+        """Topics of what the core lacks and that is asked for, and since when [s] nobody has
+        answered that it is still to come.
+        """
+        since: dict[str, float] = {}
+        for fetching, kinds in (
+            (self._phases, self._kinds),
+            (self._commits, (Commit,)),
+            (self._tasks, (TaskSpec,)),
+            (self._permissions, (Policy,)),
+            (self._labels, (StepRewards,)),
+        ):
+            if fetching.since is not None:
+                topics = [TOPICS[kind] for kind in kinds]
+                since |= {each: max(fetching.since, since.get(each, 0.0)) for each in topics}
+        return since
 
     def runs_away(self, core: Core[Any], outbox: Outbox) -> bool:
         """Whether this node learns phases again, faster than the learner does, and would soon let
@@ -144,7 +163,7 @@ class Fetcher:
             return
         if phase > self.behind:
             self._log.warning(f'phase {phase} is incomplete: asking the recorder for it')
-        kinds = [type_name(kind) for kind in OF_PHASES if kind in self._kinds]
+        kinds = [type_name(kind) for kind in self._kinds]
         self._recorder.ask(phase, lambda answer: self._arrived(RECORDER, phase, answer), kinds)
 
     def _ask_commit(self, phase: int) -> None:
@@ -155,7 +174,8 @@ class Fetcher:
 
     def _offered_commit(self, phase: int, answer: Answer) -> None:
         if answer.reason or not answer.messages:
-            return  # it has not committed the phase yet
+            self._commits.to_come(self._clock())  # it has not committed the phase yet
+            return
         if self._committed.lost(phase, self._clock()):
             said = f'the commit of phase {phase} was lost: it came again'
             self._take_all(answer, said, lost=True)
@@ -172,6 +192,8 @@ class Fetcher:
                 asker.ask(NEWEST, self._announced, [type_name(TaskSpec)])
 
     def _announced(self, answer: Answer) -> None:
+        if not answer.messages:
+            self._tasks.to_come(self._clock())
         self._take_all(answer, 'what a source has announced had not arrived: it came again')
 
     def _ask_learner(self, phase: int) -> None:
@@ -190,8 +212,15 @@ class Fetcher:
         """Ask for a policy that the learner may keep no more."""
         if self._recorder.ready:
             kinds = [type_name(Policy)]
-            said = PERMISSION.format(phase)  # if it is recorded, it was published long ago
-            self._recorder.ask(phase, lambda answer: self._take_all(answer, said), kinds)
+            self._recorder.ask(phase, lambda answer: self._recorded_policy(phase, answer), kinds)
+        else:
+            self._permissions.to_come(self._clock())
+
+    def _recorded_policy(self, phase: int, answer: Answer) -> None:
+        if answer.reason or not answer.messages:
+            self._permissions.to_come(self._clock())
+        else:
+            self._take_all(answer, PERMISSION.format(phase))  # it was published long ago
 
     def _take_all(self, answer: Answer, said: str, **how: bool) -> None:
         for kind, data in answer.messages:
@@ -217,7 +246,8 @@ class Fetcher:
             self._log.info(f'phase {phase}: {len(answer.messages)} messages came again')
 
     def _labelled(self, phase: int, answer: Answer) -> None:
-        if answer.reason:
-            return  # it has not labelled the phase yet
+        if answer.reason or not answer.messages:
+            self._labels.to_come(self._clock())  # it has not labelled the phase yet
+            return
         if phase <= self.behind or self._offered.lost(phase, self._clock()):
             self._arrived('the reward node', phase, answer)

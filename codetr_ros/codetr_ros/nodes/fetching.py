@@ -5,11 +5,17 @@ AGAIN = 5.0  # [s] until the next try
 
 
 class Fetching:
-    """Decides when to ask for a phase that stays incomplete."""
+    """Decides when to ask for a phase that stays incomplete.
+
+    Attributes:
+        since: from when on it is asked for in vain [s]: it was found missing, or somebody has
+            answered that it is still to come. None: nothing is missing.
+    """
 
     def __init__(self) -> None:
         self._missing: int | None = None
         self._due = 0.0
+        self.since: float | None = None
 
     def due(self, missing: int | None, now: float, at_once: bool = False) -> bool:
         """Whether to ask for a phase now.
@@ -21,10 +27,20 @@ class Fetching:
         """
         if missing != self._missing:
             self._missing, self._due = missing, now + (0.0 if at_once else AFTER)
+            self.since = None if missing is None else now
         if missing is None or now < self._due:
             return False
         self._due = now + AGAIN
         return True
+
+    def to_come(self, now: float) -> None:
+        """Note the answer that what is missing is still to come: it was not asked for in vain.
+
+        Args:
+            now: monotonic time [s].
+        """
+        if self._missing is not None:
+            self.since = now
 
 
 class Offered:

@@ -289,6 +289,11 @@ class Keeping:
         if self._nobody_works():
             self._sweeper.ask(self._nodes(), lacking=True)
 
+    @property
+    def asked_for(self) -> dict[str, float]:
+        """Topics of what is asked for whenever it is lost, since ever."""
+        return dict.fromkeys(RECORDED_TOPICS, 0.0)
+
     def _nobody_works(self) -> bool:
         """Whether all others have waited for a while, so that something is lacking which no count
         shows: after a node was killed, what was under way is not counted.

@@ -88,23 +88,26 @@ class Outbox:
 
     def read(self, phase: int, kinds: Collection[str] = ()) -> Iterator[Published]:
         """The records of a phase, in the order in which they were published. Announcements, where
-        they are named, come before them, whenever they were published.
+        they are named, come before them, whenever they were published. Of a phase between others
+        there may be none: not every policy is evaluated.
 
         Args:
             phase: the phase.
             kinds: types of the messages that are wanted; empty: all.
 
         Raises:
-            KeyError: nothing of it is kept; the message names the phases of which something is.
+            KeyError: it lies before or behind all phases of which something is kept; the message
+                names these.
         """
         if list(kinds) == [LABELS]:
             self._asked = max(self._asked, phase)
-        if phase not in self._phases:
+        if not min(self._phases, default=phase + 1) <= phase <= max(self._phases, default=phase):
             held = ', '.join(map(str, sorted(self._phases))) or 'none yet'
             raise KeyError(f'nothing of phase {phase} is kept; of these is: {held}')
+        of_phase = self._phases.get(phase, {}).values()
         of_all_time = self._announced.values() if kinds else ()
         return (
             (record, stamp)
-            for record, stamp in dict.fromkeys((*of_all_time, *self._phases[phase].values()))
+            for record, stamp in dict.fromkeys((*of_all_time, *of_phase))
             if not kinds or type_name(type(record)) in kinds
         )

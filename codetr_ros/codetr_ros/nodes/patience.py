@@ -36,6 +36,42 @@ class Limit:
     again: str = 'start the run again'
 
 
+class InVain:
+    """Which lost records a node has asked for in vain for too long.
+
+    A count of lost records does not state which they are. What a node does not need, or not yet,
+    it does not ask for: a policy that is not to be evaluated, or steps that no commit names. That
+    keeps nobody from going on. And what was lost only now is still to be sent again.
+    """
+
+    def __init__(self) -> None:
+        self._lost: dict[str, tuple[int, float]] = {}  # counts, and since when no record came [s]
+
+    def beyond(
+        self, seconds: float, lost: Mapping[str, int], asked_for: Mapping[str, float], now: float
+    ) -> dict[str, int]:
+        """Those of the lost records, as counts by topic, that nobody has sent for so many seconds.
+
+        Args:
+            seconds: for how long.
+            lost: counts of all lost records, by topic.
+            asked_for: topics of what is asked for, and since when [s].
+            now: monotonic time [s].
+        """
+        for topic, count in lost.items():
+            before, _ = self._lost.get(topic, (0, now))
+            if topic not in self._lost or count < before:
+                self._lost[topic] = count, now
+            else:
+                self._lost[topic] = count, self._lost[topic][1]
+        self._lost = {topic: self._lost[topic] for topic in lost}
+        return {
+            topic: count
+            for topic, (count, since) in self._lost.items()
+            if topic in asked_for and now - max(since, asked_for[topic]) > seconds
+        }
+
+
 class Patience:
     """Watches over a node that waits during the run.
 
@@ -70,8 +106,16 @@ class Patience:
         self._outside = outside
         self._left_out = left_out
         self._named: dict[str, float] = {}
+        self._in_vain = InVain()
 
-    def check(self, now: float, waiting: float, doing: str, lost: Mapping[str, int]) -> None:
+    def check(
+        self,
+        now: float,
+        waiting: float,
+        doing: str,
+        lost: Mapping[str, int],
+        asked_for: Mapping[str, float],
+    ) -> None:
         """Log which peers are silent, and give up on records that will not arrive.
 
         Args:
@@ -80,26 +124,28 @@ class Patience:
             doing: what it waits for, in words.
             lost: counts of records by topic that were published and never arrived, not even when
                 fetched again.
+            asked_for: topics of what the node lacks and asks for, and since when nobody has
+                answered that it is still to come [s, monotonic].
 
         Raises:
             NodeError: an awaited peer is gone, awaited records are lost, or everybody waits.
         """
+        in_vain = self._in_vain.beyond(self._deadline, lost, asked_for, now)
         self._check_silent(now, waiting, doing)
         self._check_finished(now, waiting, doing)
         if not self._deadline or waiting <= self._deadline:
             return
-        lacking = ', '.join(f'{n} of {topic!r}' for topic, n in sorted(lost.items()))
-        never = f'messages that were published never reached it: {lacking}' if lost else ''
         working = [peer for peer in self._others(now) if not peer.presence.waiting]
         if self._outside or working or not self._peers.by_instance:
-            if lost:
+            if in_vain:
                 raise NodeError(
-                    f'{self._who} gave up after {waiting:.0f} s: it {doing}, and {never} '
-                    f'({self._limit}). Look for an overloaded machine or network, and '
-                    f'{self._again}'
+                    f'{self._who} gave up after {waiting:.0f} s: it {doing}, and '
+                    f'{_never(in_vain)} ({self._limit}). Look for an overloaded machine or '
+                    f'network, and {self._again}'
                 )
             return
-        self._check_endless(now, f'{waiting:.0f} s: it {doing}{never and ", " + never}')
+        never = f', {_never(lost)}' if lost else ''
+        self._check_endless(now, f'{waiting:.0f} s: it {doing}{never}')
 
     def _others(self, now: float) -> list[Peer]:
         """The nodes that have not ended and are not silent."""
@@ -116,8 +162,12 @@ class Patience:
         return NodeError(f'{text}. What came first: {cause}', cause)
 
     def _check_endless(self, now: float, mine: str) -> None:
-        """Give up once all others have waited as long: nothing is under way."""
+        """Give up once all others have waited as long, and nobody has done his part within that
+        time: nothing is under way.
+        """
         others = self._others(now)
+        if now - self._peers.last_end() <= self._deadline:
+            return  # what he has published last may have been lost, and is asked for
         if any(peer.presence.waiting <= self._deadline for peer in others):
             return
         waits = [
@@ -163,3 +213,9 @@ class Patience:
                     f'was over. Look at its log, and {self._again}',
                     causes[0] if causes else self._peers.cause(),
                 )
+
+
+def _never(lost: Mapping[str, int]) -> str:
+    """What never arrived, in words."""
+    lacking = ', '.join(f'{n} of {topic!r}' for topic, n in sorted(lost.items()))
+    return f'messages that were published never reached it: {lacking}'

@@ -24,6 +24,7 @@ class Peer:
     presence: Presence
     received_at: float  # monotonic time [s] when the presence arrived
     served: bool = False  # whether it has ever taken part in the run
+    ended_at: float | None = None  # monotonic time [s] since which it is known to have finished
 
     @property
     def published(self) -> dict[str, int]:
@@ -100,7 +101,10 @@ class Peers:
         if known is not None and known.presence.finished and not presence.finished:
             return None  # an earlier one, which the last one has overtaken
         served = bool(presence.settings_hash) or (known is not None and known.served)
-        self.by_instance[presence.instance_id] = Peer(presence, now, served)
+        ended_at = known.ended_at if known is not None else None
+        if presence.finished and ended_at is None:
+            ended_at = now
+        self.by_instance[presence.instance_id] = Peer(presence, now, served, ended_at)
         self._newest = None
         who = f'{presence.role} {presence.node}'
         if known is None:
@@ -251,6 +255,11 @@ class Peers:
             peer.presence.finished or 0 < deadline < now - peer.received_at
             for peer in self.alive(role)
         )
+
+    def last_end(self) -> float:
+        """When the last node that has done its part is known to have ended [s]."""
+        ended = (p.ended_at for p in self.newest() if p.ended_at is not None and not p.failed)
+        return max(ended, default=float('-inf'))
 
     def anybody_left(self) -> bool:
         """Whether any peer has not finished."""

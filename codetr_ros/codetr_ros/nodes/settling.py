@@ -39,6 +39,9 @@ class Settling:
         self._recorded = recorded
         self.without: list[str] = []
         self.held: list[str] = []
+        self._missing: Mapping[str, int] = {}
+        self._ended: set[str] | None = None
+        self._came_at = float('-inf')  # when something that was lacking came, or a node ended
 
     def gone(self, now: float) -> list[Peer]:
         """The nodes that nobody waits for, and of which nothing is still to come.
@@ -90,14 +93,27 @@ class Settling:
             f'waits for the end of {", ".join(running) or "nobody"} '
             f'and for {", ".join(lacking) or "nothing"}'
         )
+        self._note(missing, now)
         # a node that still publishes its presence may work as long as it needs
         newest_at = max((p.received_at for p in there), default=0.0)
-        if self._deadline and min(seconds, now - newest_at) > self._deadline:
+        quiet = now - max(newest_at, self._came_at)
+        if self._deadline and min(seconds, quiet) > self._deadline:
             raise NodeError(
                 f'{self._who} gave up after {self._deadline:g} s: {doing}. The bag lacks that',
                 self._peers.cause(),
             )
         return False, doing
+
+    def _note(self, missing: Mapping[str, int], now: float) -> None:
+        """Note whether something that was lacking has come, or a node has ended: what that has
+        published last may still be lacking.
+        """
+        finished = (peer.presence for peer in self._peers.newest() if peer.presence.finished)
+        ended = {presence.instance_id for presence in finished}
+        less = any(missing.get(topic, 0) < count for topic, count in self._missing.items())
+        if less or (self._ended is not None and ended - self._ended):
+            self._came_at = now
+        self._missing, self._ended = dict(missing), ended
 
     def _silent_for_good(self, now: float) -> list[Peer]:
         """Nodes that are silent beyond the deadline, and of which nothing is to come any more."""

@@ -4,6 +4,7 @@ was cut.
 
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
@@ -21,9 +22,31 @@ TakeAgain = Callable[[type, bytes], bool]
 """Takes the bytes of a message that was sent again; returns whether it was new."""
 
 
+@dataclass
+class _Sweep:
+    """Of one node.
+
+    Attributes:
+        node: its full name.
+        phases: what it has sent, newest first.
+        phase: which it is asked for.
+        again: whether it has not answered the same question before.
+        question: counts its questions: an answer to an earlier one comes too late.
+        unnews: phases since one had something new.
+    """
+
+    node: str
+    phases: list[Messages] = field(default_factory=list)
+    phase: int = NEWEST
+    again: bool = False
+    question: int = 0
+    unnews: int = 0
+
+
 class Sweeper:
-    """Asks one node after the other for all that it keeps, from the newest phase back, and hands
-    it on in the order in which it was published.
+    """Asks nodes for all that they keep, each from the newest phase back, and hands on what a node
+    has sent in the order in which that was published. All are asked at the same time: a node whose
+    answers are lost keeps no other waiting.
 
     Args:
         make: makes what asks a node.
@@ -49,13 +72,7 @@ class Sweeper:
         self._wanted: dict[str, float] = {}  # nodes to be asked, and when at the earliest
         self._asked: dict[str, float] = {}  # when each has answered last
         self._thorough: set[str] = set()  # nodes that are to be asked for all that they keep
-        self._present: str | None = None  # the node that is asked
-        self._phases: list[Messages] = []  # what it has sent, newest first
-        self._phase = NEWEST  # which it is asked for
-        self._broken_off: dict[str, tuple[list[Messages], int]] = {}  # of nodes: both of these
-        self._goes_on = False  # whether it was broken off right before that
-        self._round = 0  # counts questions
-        self._news = 0  # phases since one had something new
+        self._present: dict[str, _Sweep] = {}  # of the nodes that are asked
 
     def ask(self, nodes: Iterable[str], lacking: bool = False) -> None:
         """Ask these nodes, each as soon as it offers to answer, and not twice in `AGAIN` seconds.
@@ -66,7 +83,7 @@ class Sweeper:
                 phase, so that they are asked for all that they keep.
         """
         for node in nodes:
-            if node != self._present:
+            if node not in self._present:
                 if lacking:
                     self._thorough.add(node)
                 self._wanted.setdefault(node, self._asked.get(node, -AGAIN) + AGAIN)
@@ -74,63 +91,54 @@ class Sweeper:
     @property
     def busy(self) -> bool:
         """Whether a node is still to be asked, or to answer."""
-        return self._present is not None or bool(self._wanted)
+        return bool(self._present or self._wanted)
 
     def check(self) -> None:
-        """Go on with the next node, where one has answered or does not answer any more."""
-        if self._present is not None:
-            if self._asker(service_of(self._present)).busy:
-                return
-            # it was killed meanwhile, or the answer was lost: ask it once more, from there on
-            self._wanted[self._present] = 0.0
-            self._broken_off[self._present] = self._phases, self._phase
-            self._end()
+        """Ask the nodes that are to be asked, and those that do not answer any more once more."""
         now = self._clock()
+        for sweep in list(self._present.values()):
+            asker = self._asker(service_of(sweep.node))
+            if not asker.busy and asker.ready:  # it was killed meanwhile, or the answer was lost
+                sweep.again = sweep.phase != NEWEST
+                self._ask(sweep)
         for node in [node for node, due in self._wanted.items() if due <= now]:
             if self._asker(service_of(node)).ready:
                 del self._wanted[node]
-                self._present, self._news = node, 0
-                self._goes_on = node in self._broken_off
-                self._phases, phase = self._broken_off.pop(node, ([], NEWEST))
-                self._ask(phase)
-                return
+                sweep = self._present[node] = _Sweep(node)
+                self._ask(sweep)
 
-    def _ask(self, phase: int) -> None:
-        node = self._present
-        assert node is not None
-        self._phase = phase
-        self._round += 1
-        asked = self._round
-        asker = self._asker(service_of(node))
-        asker.ask(phase, lambda answer: self._answered(asked, answer))
+    def _ask(self, sweep: _Sweep) -> None:
+        sweep.question += 1
+        asked = sweep.question
+        asker = self._asker(service_of(sweep.node))
+        asker.ask(sweep.phase, lambda answer: self._answered(sweep, asked, answer))
 
-    def _answered(self, asked: int, answer: Answer) -> None:
-        if asked != self._round or self._present is None:
-            return  # too late: it was given up, or another node is asked
+    def _answered(self, sweep: _Sweep, asked: int, answer: Answer) -> None:
+        if asked != sweep.question:
+            return  # too late: it was asked once more
         if answer.phase is None:  # it keeps nothing earlier, or was started again since
-            if self._goes_on:
-                self._goes_on = False
-                self._ask(NEWEST)
+            if sweep.again:
+                sweep.again, sweep.phase = False, NEWEST
+                self._ask(sweep)
             else:
-                self._end()
+                self._end(sweep)
             return
-        self._goes_on = False
-        self._phases.append(answer.messages)
+        sweep.again = False
+        sweep.phases.append(answer.messages)
         new = any(not self._known(kind, data) for kind, data in answer.messages)
-        self._news = 0 if new else self._news + 1
-        goes_on = self._news < UNNEWS or self._present in self._thorough
+        sweep.unnews = 0 if new else sweep.unnews + 1
+        goes_on = sweep.unnews < UNNEWS or sweep.node in self._thorough
         if goes_on and answer.phase > 0:
-            self._ask(answer.phase - 1)
+            sweep.phase = answer.phase - 1
+            self._ask(sweep)
         else:
-            self._end()
+            self._end(sweep)
 
-    def _end(self) -> None:
-        node, phases = self._present, self._phases
-        assert node is not None
-        self._present, self._phases = None, []
-        if node not in self._broken_off:
-            self._thorough.discard(node)
+    def _end(self, sweep: _Sweep) -> None:
+        node = sweep.node
+        del self._present[node]
+        self._thorough.discard(node)
         self._asked[node] = self._clock()
-        sent = [message for messages in reversed(phases) for message in messages]
+        sent = [message for messages in reversed(sweep.phases) for message in messages]
         if new := sum(self._take(kind, data) for kind, data in sent):
             self._log.warning(f'{new} messages of {node} had not arrived: it has sent them again')

@@ -280,6 +280,13 @@ class Membership:
             return False
         return self._fetcher.runs_away(self.traffic.core, self._outbox)
 
+    @property
+    def asked_for(self) -> dict[str, float]:
+        """Topics of what the core lacks and that is asked for, and since when that is in vain [s,
+        monotonic].
+        """
+        return {} if self._fetcher is None else self._fetcher.asked_for
+
     # ---- runs and peers
 
     def _note_run(self, spec: RunSpec, data: bytes) -> None:

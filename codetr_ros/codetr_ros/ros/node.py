@@ -20,6 +20,7 @@ from typing import Any
 
 from codetr_ros.nodes import errors
 from codetr_ros.nodes.attention import Attention
+from codetr_ros.nodes.waiting import Waiting
 from codetr_ros.processes.launcher import ROBOT_NODE
 from codetr_ros.records import TOPICS
 from codetr_ros.ros import joining
@@ -95,7 +96,7 @@ class Node:
         work = core.work()
         patience = member.patience([TOPICS[kind] for kind in core.subscribes])
         attention = Attention()
-        waiting: float | None = None  # since when
+        waiting = Waiting()
         worked = False  # the core has yielded something
         while not member.stop:
             member.turn()
@@ -110,22 +111,23 @@ class Node:
             wiring.show(given or (), member.doing)
             if given is not None:
                 attention.was_away(time.monotonic())  # a slice may take long
-                worked, waiting = True, None
+                worked = True
+                waiting.over()
                 member.doing, member.waits_since = 'works', None
                 continue
             now = time.monotonic()
-            if (away := attention.was_away(now)) and waiting is not None:
+            if (away := attention.was_away(now)) and waiting.since is not None:
                 self._log.warning(f'was held for {away:.0f} s, in which it read nothing')
                 wiring.held()
-                waiting = None
-            waiting = now if waiting is None else waiting
-            if core.finished:
-                member.doing, member.waits_since = 'has finished', waiting
-                if wiring.settled(now - waiting):
-                    return
-            else:
-                member.doing, member.waits_since = wiring.waits(), waiting
-                patience.check(now, now - waiting, member.doing, member.traffic.lost())
+                waiting.over()
+            member.doing = 'has finished' if core.finished else wiring.waits()
+            seconds = waiting.seconds(member.doing, now)
+            member.waits_since = waiting.since
+            if not core.finished:
+                lost, asked_for = member.traffic.lost(), wiring.asked_for()
+                patience.check(now, seconds, member.doing, lost, asked_for)
+            elif wiring.settled(seconds):
+                return
             member.turn(wiring.pause())
 
     def _slice(self, work: Iterator[Any], worked: bool) -> Any:

@@ -12,7 +12,7 @@ bag; without a bag, the last ones from memory.
 
 import time
 from collections import deque
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -144,6 +144,10 @@ class Recording(Wiring):
         """
         self._keeping.look_after()
         return super().waits()
+
+    def asked_for(self) -> Mapping[str, float]:
+        """Topics of what the recorder asks for: all that it records."""
+        return self._keeping.asked_for
 
     def settled(self, seconds: float) -> bool:
         """Whether all nodes have finished and all their records are in the bag.

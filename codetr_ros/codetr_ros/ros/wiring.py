@@ -1,6 +1,6 @@
 """Wires the core of a node to the topics of its run."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from codetr_ros.nodes.restoring import go_on
@@ -100,6 +100,12 @@ class Wiring:
         if self.member.runs_away:
             return 'waits for the learner to take in the labels of the phases before'
         return f'waits for {self.joined.core.waiting_for()}'
+
+    def asked_for(self) -> Mapping[str, float]:
+        """Topics of what the node lacks and asks for, and since when that is in vain [s,
+        monotonic].
+        """
+        return self.member.asked_for
 
     def settled(self, seconds: float) -> bool:
         """Whether the node may end, `seconds` after its core has finished."""

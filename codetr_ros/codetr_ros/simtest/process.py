@@ -5,7 +5,7 @@ what is missing, work one slice, publish what came out.
 """
 
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -31,6 +31,7 @@ from codetr_ros.nodes.restoring import (
     take_place,
 )
 from codetr_ros.nodes.traffic import Traffic
+from codetr_ros.nodes.waiting import Waiting
 from codetr_ros.records import TOPICS, Commit, Presence, Record, RunSpec, describe
 from codetr_ros.records.roles import READ_BY_ITSELF, published_by
 from codetr_ros.simtest.asking import Asker, FetchAnswer, FetchRequest
@@ -193,7 +194,7 @@ class Process:
         self._seen: set[int] = set()
         self._presence_at = -PRESENCE_EVERY
         self._stamp = 0  # of the newest message [ns]
-        self._waiting: float | None = None  # since when [s]
+        self._waiting = Waiting()
         self._begun = False
         self._was_held = False
         self._turn_due = 0  # number of the turn that is to come
@@ -263,7 +264,7 @@ class Process:
             return None
         if self._was_held:
             self._was_held = False
-            self._waiting = None
+            self._waiting.over()
             self.held()
         if self.pauses():
             return None
@@ -274,21 +275,21 @@ class Process:
         for record in given or ():
             self.deliver(record)
         if given is not None:
-            self._waiting = None
+            self._waiting.over()
             return self.world.rng.expovariate(1 / self.place.pace.slice_seconds)
         self._wait()
         return None
 
     def _wait(self) -> None:
         now = self.world.now
-        self._waiting = now if self._waiting is None else self._waiting
+        self.doing = 'has finished' if self.core.finished else self.waits()
+        seconds = self._waiting.seconds(self.doing, now)
         if self.core.finished:
-            self.doing = 'has finished'
-            if self.settled(now - self._waiting):
+            if self.settled(seconds):
                 self.leave()
             return
-        self.doing = self.waits()
-        self._patience.check(now, now - self._waiting, self.doing, self.traffic.lost())
+        lost, asked_for = self.traffic.lost(), self.asked_for()
+        self._patience.check(now, seconds, self.doing, lost, asked_for)
 
     def waits(self) -> str:
         """What the node waits for, in words. A simulator that was left out goes on where the run
@@ -304,6 +305,10 @@ class Process:
 
     def _over(self) -> bool:
         return self._behind is not None and self._behind.over(self.peers)
+
+    def asked_for(self) -> Mapping[str, float]:
+        """Topics of what the node lacks and asks for, and since when [s] that is in vain."""
+        return self._fetcher.asked_for
 
     def held(self) -> None:
         """Note that the process was held, and has read nothing for a while."""
@@ -360,14 +365,12 @@ class Process:
     def _lacks(self, lacking: list[str]) -> bool:
         """Whether something is lacking; gives up if it is for too long."""
         if not lacking:
-            self._waiting = None
+            self._waiting.over()
             return False
-        doing, now = f'waits for {"; ".join(lacking)}', self.world.now
-        if doing != self.doing or self._waiting is None:
-            self.doing, self._waiting = doing, now
-        if now - self._waiting > self.limit.seconds:
+        self.doing = f'waits for {"; ".join(lacking)}'
+        if self._waiting.seconds(self.doing, self.world.now) > self.limit.seconds:
             raise NodeError(
-                f'/{self.name} gave up after {self.limit.seconds:g} s: it {doing}',
+                f'/{self.name} gave up after {self.limit.seconds:g} s: it {self.doing}',
                 self.peers.cause(),
             )
         return True
@@ -478,8 +481,8 @@ class Process:
         if over:
             cause = self.error and first_cause(self.error, f'{self.role} /{self.name}')
             doing = f'{GAVE_UP}{cause}' if cause else 'has finished'
-        elif self._waiting is not None:
-            waiting = self.world.now - self._waiting
+        elif self._waiting.since is not None:
+            waiting = self.world.now - self._waiting.since
         presence = Presence(
             run_id=self.run.run_id,
             role=self.role,

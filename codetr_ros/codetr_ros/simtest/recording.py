@@ -3,6 +3,7 @@ real recorder decides.
 """
 
 from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
 from typing import cast
 
@@ -168,6 +169,10 @@ class Recording(Process):
         """
         self._keeping.look_after()
         return super().waits()
+
+    def asked_for(self) -> Mapping[str, float]:
+        """Topics of what the recorder asks for: all that it records."""
+        return self._keeping.asked_for
 
     def settled(self, seconds: float) -> bool:
         """Whether all nodes have finished and all their records are in the bag."""
