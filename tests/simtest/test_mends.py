@@ -27,11 +27,13 @@ from codetr_ros.records import TOPICS, Policy, StepRewards
 from codetr_ros.runs import checkpoints
 from codetr_ros.simtest import disks, process
 from codetr_ros.simtest.disks import Trouble
+from codetr_ros.simtest.losing import losing
 from codetr_ros.simtest.network import Weather
 from codetr_ros.simtest.plan import Death, all_settings, plan
 from codetr_ros.simtest.process import Pace
 from codetr_ros.simtest.run import carry_out, undisturbed
 from helpers.deaths import deadly
+from helpers.slow_runs import slow_and_losing
 
 MOST = 150
 """Seeds that are tried."""
@@ -180,6 +182,20 @@ def wait_with_all_others(patch):
     patch.setattr(patience.Patience, '_check_endless', lambda self, now, mine: None)
 
 
+def give_up_on_what_is_still_to_come(patch):
+    patch.setattr(fetching.Fetching, 'to_come', lambda self, now: None)
+
+
+def keep_no_phase_between_others(patch):
+    def read(self, phase, kinds=()):
+        if phase not in self._phases:
+            raise KeyError(f'nothing of phase {phase} is kept')
+        return real(self, phase, kinds)
+
+    real = outbox.Outbox.read
+    patch.setattr(outbox.Outbox, 'read', read)
+
+
 def end_before_all_is_there(patch):
     patch.setattr(settling.Settling, 'check', lambda self, missing, seconds, now: (True, ''))
 
@@ -320,6 +336,8 @@ MENDS: dict[Callable, str] = {
     judge_before_records_were_in_doubt: 'gave up',
     never_give_up: 'stuck',
     wait_with_all_others: 'stuck',
+    give_up_on_what_is_still_to_come: 'gave up',
+    keep_no_phase_between_others: 'gave up',
     end_before_all_is_there: 'were published on|names no cause|not sound',
     take_labels_again: 'repeated messages',
     believe_strangers: 'other weights|not sound|gave up|fault',
@@ -407,6 +425,11 @@ def slow_and_lossy(planned):
     return replace(planned, weather=Weather(delay=0.5, overrun=0.2))
 
 
+def much_lost(planned):
+    """A run that loses a fifth of everything, some of whose nodes are killed."""
+    return losing(61 + planned.seed)  # so few fail
+
+
 def crowded(planned):
     """The same run, but that some never reaches the recorder, and strangers publish a lot."""
     return replace(planned, weather=replace(planned.weather, overrun=0.05, strangers=0.3))
@@ -417,6 +440,8 @@ PLANS = {
     forget_who_has_ended: overtaken,
     accept_gaps: overrun,
     wait_with_all_others: unanswered,
+    give_up_on_what_is_still_to_come: lambda planned: slow_and_losing(planned.seed),
+    keep_no_phase_between_others: much_lost,
     never_ask_for_announcements: lossy,
     never_ask_for_commits: lossy,
     never_ask_for_labels: lossy,

@@ -14,6 +14,7 @@ from codetr_ros.simtest.network import Weather
 from codetr_ros.simtest.plan import DEADLINE, all_settings, plan
 from codetr_ros.simtest.process import Pace
 from codetr_ros.simtest.run import carry_out, simulate
+from helpers.slow_runs import slow_and_losing
 
 QUICK, MANY = range(24), range(24, 120)
 FOUND = (43, 247, 475, 583, 792, 821, 50070, 50636)
@@ -38,6 +39,14 @@ def test_seeds_that_once_failed_end_as_if_nothing_had_happened_or_by_name():
 
 def test_where_a_fifth_of_all_is_lost_and_nodes_are_killed_nobody_waits_in_vain():
     assert {seed: found for seed in LOSING if (found := carry_out(losing(seed)).failures)} == {}
+
+
+@pytest.mark.parametrize('seed', [4, 6])
+def test_an_evaluator_gives_up_on_no_policy_that_it_does_not_need(seed):
+    ended = carry_out(slow_and_losing(seed), kept=20_000)
+    assert ended.failures == []
+    assert ended.errors == {}
+    assert any('policy to evaluate is lost' in line for line in ended.trace)
 
 
 def test_no_loss_is_hidden_where_many_messages_never_reach_the_recorder():
