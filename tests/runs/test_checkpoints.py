@@ -11,6 +11,8 @@ import torch
 
 from codetr_ros.runs import checkpoints
 from codetr_ros.runs.checkpoints import CheckpointError
+from codetr_ros.system.disk import Disk
+from codetr_ros.system.files import FileError
 
 
 def state() -> dict[str, torch.Tensor]:
@@ -247,6 +249,22 @@ def test_what_cannot_be_saved_is_refused_before_anything_is_written(
         checkpoints.save(tmp_path, **(arguments | changes))
 
     assert list(tmp_path.iterdir()) == []
+
+
+class Vanishes(Disk):
+    """A disk whose folder is a file all of a sudden, right behind a rename."""
+
+    def replace(self, old: Path, new: Path) -> None:
+        super().replace(old, new)
+        new.parent.rename(new.parent.with_name('away'))
+        new.parent.touch()
+
+
+def test_a_folder_that_vanishes_during_a_save_is_named_with_the_reason(tmp_path: Path) -> None:
+    folder = tmp_path / 'checkpoints'
+    with pytest.raises(FileError, match='Not a directory') as error:
+        checkpoints.save(folder, 'm', 0, {'w': torch.zeros(2)}, {}, disk=Vanishes())
+    assert str(error.value).startswith(f'{folder} cannot be written: ')
 
 
 def test_a_folder_that_was_copied_elsewhere_still_loads(tmp_path: Path) -> None:

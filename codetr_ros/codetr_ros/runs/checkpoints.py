@@ -24,7 +24,7 @@ import torch
 
 from codetr_ros.runs import checkpoint_names
 from codetr_ros.system.disk import Disk
-from codetr_ros.system.files import make_folder, sync_folder
+from codetr_ros.system.files import make_folder, named_errors, sync_folder
 from codetr_ros.system.parsing import brief, parse_json, shortened
 from codetr_ros.system.tensors import Part
 from codetr_ros.system.tensors import digest as digest_of
@@ -102,7 +102,7 @@ def save(
 
     Raises:
         CheckpointError: the name, phase, `keep` or `meta` is refused; nothing has changed then.
-        OSError: the disk is full or not writable; the older checkpoints are untouched then.
+        FileError: the disk is full or not writable, or an old checkpoint cannot be removed.
     """
     if not re.fullmatch(r'[A-Za-z0-9_][A-Za-z0-9_.-]*', name):
         raise CheckpointError(f'checkpoint name {name!r}: use letters, digits, "_", "." and "-"')
@@ -131,11 +131,18 @@ def save(
             f'checkpoint {name}, phase {phase}: meta cannot be written as JSON: {error}'
         ) from None
 
-    disk = disk or Disk()
+    with named_errors(folder):
+        return _write(folder, f'{name}-{phase:06d}', data, description, keep, disk or Disk())
+
+
+def _write(
+    folder: Path, made: str, data: bytes, description: bytes, keep: int, disk: Disk
+) -> Path:
+    """Write a checkpoint and remove old ones."""
+    name = made.rpartition('-')[0]
     make_folder(folder)
     _remove_partial(folder, name)
-    path = folder / f'{name}-{phase:06d}'
-    partial = folder / f'.{name}-{phase:06d}.partial'
+    path, partial = folder / made, folder / f'.{made}.partial'
     make_folder(partial)
     disk.write(partial / TENSORS, data)
     disk.write(partial / DESCRIPTION, description)
@@ -143,7 +150,7 @@ def save(
     if path.exists():
         # A rename cannot replace a folder that is not empty. The name counts as partial: if the
         # machine stops between the two renames, the next older checkpoint is the latest.
-        disk.replace(path, folder / f'.{name}-{phase:06d}.replaced.partial')
+        disk.replace(path, folder / f'.{made}.replaced.partial')
     disk.replace(partial, path)
     sync_folder(folder)
     _remove_partial(folder, name)
@@ -272,8 +279,9 @@ def remove_after(folder: Path, name: str, phase: int) -> list[Path]:
     has gone back to it makes them again.
     """
     later = [path for path in every(folder, name) if phase_of(path) > phase]
-    for path in later:
-        shutil.rmtree(path)
+    with named_errors(folder):
+        for path in later:
+            shutil.rmtree(path)
     return later
 
 

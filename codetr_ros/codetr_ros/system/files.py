@@ -8,7 +8,8 @@ import errno
 import os
 import re
 import tempfile
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 _PARTIAL = '.partial'
@@ -38,6 +39,21 @@ class FileError(OSError):
 def remedy(error: OSError) -> str:
     """What lets a file be written that could not be, as the beginning of a sentence."""
     return _REMEDIES.get(error.errno or 0, 'remove the cause')
+
+
+@contextmanager
+def named_errors(folder: Path) -> Iterator[None]:
+    """Let every error of the disk name the folder in which something is written or removed.
+
+    Raises:
+        FileError: there was one.
+    """
+    try:
+        yield
+    except FileError:
+        raise
+    except OSError as error:
+        raise FileError(error.errno, error.strerror, str(folder)) from error
 
 
 def check_writable(folder: Path) -> None:
@@ -81,12 +97,17 @@ def make_folder(folder: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make renames and new names in a folder survive a power loss."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    """Make renames and new names in a folder survive a power loss.
+
+    Raises:
+        FileError: the folder is not there any more, or the disk fails.
+    """
+    with named_errors(folder):
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def write_synced(path: Path, data: bytes, wait: bool = True) -> None:
@@ -131,14 +152,14 @@ def atomic_write(path: Path, data: bytes | str, wait: bool = True) -> None:
             whole new one, and a machine that loses its power may have neither.
 
     Raises:
-        OSError: the disk is full or the folder cannot be written; `path` is then unchanged.
+        FileError: the disk is full or the folder cannot be written; `path` is then unchanged.
     """
     content = data.encode() if isinstance(data, str) else data
     partial = path.with_name(f'.{path.name}.{os.getpid()}{_PARTIAL}')
     try:
         write_synced(partial, content, wait)
         os.replace(partial, path)
-    except FileError as error:
+    except OSError as error:
         _remove(partial)
         raise FileError(error.errno, error.strerror, str(path)) from None
     except BaseException:
