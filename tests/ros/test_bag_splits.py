@@ -108,7 +108,7 @@ def test_a_killed_writer_leaves_all_files_but_the_last_whole(tmp_path):
     )
     count = int(process.stdout.readline())
     process.send_signal(signal.SIGKILL)
-    process.wait(10)
+    process.wait(120)
     *whole, last = files(tmp_path / 'bag')
     found = []
     for path in whole:

@@ -114,7 +114,7 @@ def test_all_that_was_flushed_survives_sigkill(tmp_path):
     )
     assert process.stdout.readline() == 'flushed\n'
     process.send_signal(signal.SIGKILL)
-    process.wait(10)
+    process.wait(120)
     assert sequences(tmp_path / 'bag' / 'bag_0.mcap')[:30] == list(range(30))
 
 
