@@ -1,8 +1,10 @@
-"""Simulated runs whose simulators take their time, where much is lost."""
+"""Simulated runs whose simulators, or whose messages, take their time."""
 
 from dataclasses import replace
 
+from codetr_ros.simtest.disks import Trouble
 from codetr_ros.simtest.losing import losing
+from codetr_ros.simtest.network import Weather
 from codetr_ros.simtest.plan import Plan, names_of
 from codetr_ros.simtest.process import Pace
 
@@ -18,3 +20,12 @@ def slow_and_losing(seed: int) -> Plan:
         for name, role in names_of(settings).items()
     }
     return replace(planned, settings=settings, paces=paces, deaths=(), leave_out_after=0.0)
+
+
+def far_apart(planned: Plan) -> Plan:
+    """The same run, but that a message takes three seconds on average and may overtake others, and
+    nothing else happens.
+    """
+    planned = replace(planned, paces={name: Pace() for name in planned.paces}, deaths=())
+    planned = replace(planned, weather=Weather(delay=3.0, reorder=True), leave_out_after=0.0)
+    return replace(planned, disk=Trouble(), checkpoints=Trouble(), heals=True)

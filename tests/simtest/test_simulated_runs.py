@@ -14,7 +14,7 @@ from codetr_ros.simtest.network import Weather
 from codetr_ros.simtest.plan import DEADLINE, all_settings, plan
 from codetr_ros.simtest.process import Pace
 from codetr_ros.simtest.run import carry_out, simulate
-from helpers.slow_runs import slow_and_losing
+from helpers.slow_runs import far_apart, slow_and_losing
 
 QUICK, MANY = range(24), range(24, 120)
 FOUND = (43, 247, 475, 583, 792, 821, 50070, 50636)
@@ -47,6 +47,11 @@ def test_an_evaluator_gives_up_on_no_policy_that_it_does_not_need(seed):
     assert ended.failures == []
     assert ended.errors == {}
     assert any('policy to evaluate is lost' in line for line in ended.trace)
+
+
+@pytest.mark.parametrize('seed', [28, 60])
+def test_questions_whose_answers_take_longer_than_the_next_try_are_answered(seed):
+    assert carry_out(far_apart(plan(seed))).failures == []
 
 
 def test_no_loss_is_hidden_where_many_messages_never_reach_the_recorder():

@@ -82,7 +82,8 @@ class Asks(Protocol):
     def ask(
         self, phase: int, answered: Callable[[Answer], None], kinds: Collection[str] = ()
     ) -> None:
-        """Ask for a phase; an earlier question that has no answer yet is forgotten.
+        """Ask for a phase. An earlier question that has no answer yet is forgotten; if it was the
+        same, an answer to it will do: where answers take long, none would ever come otherwise.
 
         Args:
             phase: which one, or `NEWEST`.

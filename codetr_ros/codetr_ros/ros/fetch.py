@@ -24,6 +24,9 @@ from codetr_ros.records.fields import RECORD_TYPES
 from codetr_ros.records.shown import shown
 from codetr_ros.ros.link import Link
 
+MOST_PENDING = 12
+"""Requests for the same that may still be answered: those of a minute."""
+
 
 def answer_signature(key: bytes, service: str, request: Any, response: Any) -> bytes:
     """The signature of an answer, which fits one request alone.
@@ -78,8 +81,8 @@ class Asker:
         self._run_id = run_id
         self._client = link.node.create_client(FetchPhase, service)
         self._full_name = link.node.resolve_service_name(service)
-        self._pending: Any = None  # the future of the last request
-        self._question = 0  # the number of the present one
+        self._pending: list[Any] = []  # the futures of the requests that may still be answered
+        self._question: _Question | None = None  # the present one
         self._asked_at: float | None = None  # when the last part was asked for
 
     @property
@@ -100,15 +103,20 @@ class Asker:
     def ask(
         self, phase: int, answered: Callable[[Answer], None], kinds: Collection[str] = ()
     ) -> None:
-        """Ask for a phase; an earlier question that has no answer yet is forgotten.
+        """Ask for a phase. An earlier question that has no answer yet is forgotten; if it was the
+        same, an answer to it will do.
 
         Args:
             phase: which one, or `NEWEST`.
             answered: called by the main loop, once all parts have come or nothing is sent.
             kinds: types of the messages that are wanted; empty: all.
         """
-        self._question += 1
-        self._ask(_Question(self._question, phase, tuple(kinds), answered))
+        question, wanted = self._question, (phase, tuple(kinds))
+        if self._asked_at is None or question is None or question.wanted != wanted:
+            self._forget()
+            question = self._question = _Question(wanted, phase, answered)
+        question.answered = answered
+        self._ask(question)
 
     def _ask(self, question: '_Question') -> None:
         self._asked_at = time.monotonic()
@@ -116,22 +124,24 @@ class Asker:
             run_id=self._run_id,
             phase=question.phase,
             requester=self._link.full_name,
-            kinds=list(question.kinds),
+            kinds=list(question.wanted[1]),
             part=question.part,
             nonce=np.frombuffer(secrets.token_bytes(16), np.uint8),
         )
-        self._forget()
-        self._pending = self._client.call_async(request)
+        future = self._client.call_async(request)
         # the future stays pending: with the first answer, the middleware would drop all others
-        self._pending.set_result = lambda response: self._link.store(
+        future.set_result = lambda response: self._link.store(
             self._arrived, question, request, response
         )
+        self._pending.append(future)
+        if len(self._pending) > MOST_PENDING:
+            self._client.remove_pending_request(self._pending.pop(0))
 
     def _forget(self) -> None:
-        """Take no answer to the last request any more."""
-        if self._pending is not None:
-            self._client.remove_pending_request(self._pending)
-            self._pending = None
+        """Take no answer to the requests so far any more."""
+        for future in self._pending:
+            self._client.remove_pending_request(future)
+        self._pending.clear()
 
     def _check(self, request: Any, response: Any) -> None:
         """Refuse an answer that is not signed with the key of the run, if there is one.
@@ -151,7 +161,7 @@ class Asker:
             )
 
     def _arrived(self, question: '_Question', request: Any, response: Any) -> None:
-        if question.number != self._question or self._asked_at is None:
+        if question is not self._question or self._asked_at is None:
             return
         if question.part != request.part:
             return  # a second answer for a part that has come
@@ -193,9 +203,8 @@ def askers(link: Link, run_id: str) -> MakeAsks:
 
 @dataclass
 class _Question:
-    number: int
-    phase: int
-    kinds: tuple[str, ...]
+    wanted: tuple[int, tuple[str, ...]]  # the phase and the kinds that are asked for
+    phase: int  # which of them it is, once the first part has come
     answered: Callable[[Answer], None]
     part: int = 0
     messages: list[tuple[type, bytes]] = field(default_factory=list)

@@ -41,7 +41,8 @@ class Asker:
         self.service = service
         self._by = by
         self._reader = 'record' if service == SERVICE else service.split('/')[1]
-        self._question = 0  # the number of the present one
+        self._wanted: tuple[int, tuple[str, ...]] | None = None
+        self._questions: set[int] = set()  # the numbers of those for it
         self._answered: Callable[[Answer], None] = lambda answer: None
         self._asked_at: float | None = None
 
@@ -58,15 +59,21 @@ class Asker:
     def ask(
         self, phase: int, answered: Callable[[Answer], None], kinds: Collection[str] = ()
     ) -> None:
-        """Ask for a phase; an earlier question that has no answer yet is forgotten."""
-        self._question = self._by.world.number()
-        self._answered, self._asked_at = answered, self._by.world.now
-        request = FetchRequest(self._question, phase, tuple(kinds), self._by.name)
+        """Ask for a phase. An earlier question that has no answer yet is forgotten; if it was the
+        same, an answer to it will do.
+        """
+        wanted = phase, tuple(kinds)
+        if self._asked_at is None or self._wanted != wanted:
+            self._questions.clear()
+        number = self._by.world.number()
+        self._questions.add(number)
+        self._wanted, self._answered, self._asked_at = wanted, answered, self._by.world.now
+        request = FetchRequest(number, *wanted, self._by.name)
         self._by.world.note(self._by.name, f'asks {self._reader} for phase {phase}')
         self._by.ask(self, self._reader, request)
 
     def arrived(self, given: FetchAnswer) -> None:
         """Take an answer."""
-        if given.number == self._question and self._asked_at is not None:
+        if given.number in self._questions and self._asked_at is not None:
             self._asked_at = None
             self._answered(given.answer)
