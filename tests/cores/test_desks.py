@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from codetr_ros.cores.desks import MOST_SCORERS, MOST_STEPS, Desks
+from codetr_ros.cores.desks import ASKS_WITHIN, MOST_SCORERS, MOST_STEPS, Desks
 from codetr_ros.cores.scoring import ScoringError
 from helpers.builders import commit, run, score_request, tiny, transitions
 
@@ -44,6 +44,19 @@ def test_a_segment_is_wanted_until_its_scorer_has_judged_it_and_what_was_taken_i
     assert (vision.count, vision.taken) == (1, -1)
     desks.receive(commit(scorers=('vision',), scores=np.array([0], np.int64)))
     assert (vision.count, vision.taken, ben.taken) == (1, 0, -1)
+
+
+def test_whoever_asked_lately_is_to_receive_that_the_run_has_ended():
+    desks = some_desks()
+    vision, ben = desks.desk('vision', ''), desks.desk('ben', '')
+    assert not desks.awaits(0.0)  # nobody has asked
+    assert not desks.inform(ben, 0.0)
+    assert not desks.inform(vision, 5.0)
+    desks.receive(commit(phase=SETTINGS.phases - 1))
+    assert desks.awaits(6.0)
+    assert desks.inform(vision, 6.0)
+    assert desks.awaits(7.0)  # the other one has not
+    assert not desks.awaits(ASKS_WITHIN + 1)  # nor does it ask any more
 
 
 def test_the_steps_of_wanted_segments_are_those_that_came():

@@ -26,6 +26,8 @@ NAME = re.compile('[A-Za-z0-9_-]{1,64}')
 MOST_SCORERS = 64
 """Desks that are opened where the run admits anybody."""
 LONGEST_REASON = 255
+ASKS_WITHIN = 30.0
+"""Seconds in which a scorer asks again, as long as it scores."""
 MOST_STEPS = 10_000
 """Steps that an answer holds at most, unless a single segment has more."""
 
@@ -65,6 +67,7 @@ class Desks(Part):
         self.token = ''
         self.seen = Seen(run, settings)
         self._desks: dict[str, Desk] = {}
+        self._asked: dict[str, float] = {}  # before the end: when each asked last [s, monotonic]
 
     @property
     def finished(self) -> bool:  # type: ignore[override]
@@ -89,6 +92,27 @@ class Desks(Part):
             yield given or None
 
     # ---- scorers
+
+    def inform(self, desk: Desk, now: float) -> bool:
+        """Whether the run has ended, for the answer to a scorer.
+
+        Args:
+            desk: that of the scorer.
+            now: monotonic time [s].
+        """
+        if self.finished:
+            self._asked.pop(desk.scorer, None)
+        else:
+            self._asked[desk.scorer] = now
+        return self.finished
+
+    def awaits(self, now: float) -> bool:
+        """Whether a scorer that has asked lately has not received that the run has ended.
+
+        Args:
+            now: monotonic time [s].
+        """
+        return any(now - at < ASKS_WITHIN for at in self._asked.values())
 
     def desk(self, scorer: str, token: str) -> Desk:
         """The desk of a scorer.

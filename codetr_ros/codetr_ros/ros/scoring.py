@@ -1,6 +1,7 @@
 """The services with which anything scores: `score_segment` and `wanted_segments`."""
 
 import math
+import time
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -87,9 +88,16 @@ class ScoringServices(Wiring):
         return self._state(desk, response)
 
     def _state(self, desk: Desk, response: Any) -> Any:
-        response.phase, response.finished = self._desks.seen.phase, self._desks.seen.finished
+        response.phase = self._desks.seen.phase
+        response.finished = self._desks.inform(desk, time.monotonic())
         response.given, response.taken = desk.count, desk.taken
         return response
+
+    def settled(self, seconds: float) -> bool:
+        """Whether all programs that score have received that the run has ended: they would wait
+        in vain for services that are gone.
+        """
+        return not self._desks.awaits(time.monotonic())
 
     def _refuse(self, scorer: str, service: str, error: ScoringError, response: Any) -> Any:
         """Answer why nothing is taken, and log it: the first ten times, then every thousandth."""
