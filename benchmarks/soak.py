@@ -10,8 +10,8 @@ the minute before. The run ends after so many hours or steps. The same command g
 that was ended, or whose machine was (`codetr train --resume`), and with its table.
 
 Writes `results/soak.csv`, and `results/soak.md` with the slope of each column: a line fitted by
-least squares to all minutes after the first tenth of each session, in which nodes fill their
-memories.
+least squares to all minutes after the first tenth of each session, and to those of its last fifth.
+Until then nodes fill what they remember: a recorder the newest 100 000 records, say.
 """
 
 import argparse
@@ -112,18 +112,23 @@ def write_table() -> None:
     sessions = sorted({int(row['session']) for row in rows})
     lines = ['# A run of hours', '']
     steady: list[dict[str, str]] = []
+    late: list[dict[str, str]] = []
     for session in sessions:
         own = [row for row in rows if int(row['session']) == session]
         steady += own[len(own) // 10 :]
+        late += own[-(-len(own) * 4 // 5) :]
         lines.append(f'- session {session}: {len(own)} samples in {own[-1]["seconds"]} s')
-    per_phase = [float(row['phase']) for row in steady]
     lines += [
-        '', '| column | first | last | slope per 1000 phases |', '|---|---:|---:|---:|',
+        '', '| column | first | last | slope per 1000 phases | in the last fifth |',
+        '|---|---:|---:|---:|---:|',
     ]  # fmt: skip
     for name in COLUMNS[3:]:
-        values = [float(row[name]) for row in steady]
-        each = 1000 * slope(per_phase, values)
-        lines.append(f'| {name} | {values[0]:.3g} | {values[-1]:.3g} | {each:+.3g} |')
+        slopes = [
+            1000 * slope([float(row['phase']) for row in some], [float(row[name]) for row in some])
+            for some in (steady, late)
+        ]
+        ends = ' | '.join(f'{float(row[name]):.3g}' for row in (steady[0], steady[-1]))
+        lines.append(f'| {name} | {ends} | ' + ' | '.join(f'{x:+.2f}' for x in slopes) + ' |')
     facts = machine.facts(machine.load(), ('numpy', 'torch'))
     lines += ['', *(f'- {name}: {fact}' for name, fact in facts.items())]
     lines.append(f'- run: codetr train {" ".join(FLAGS)}')
