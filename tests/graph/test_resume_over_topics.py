@@ -19,7 +19,6 @@ from codetr_ros.cores import in_process
 from codetr_ros.nodes.outbox import KEPT_PHASES
 from codetr_ros.offline.replay import replay
 from codetr_ros.runs import origin
-from codetr_ros.runs.checkpoints import DESCRIPTION
 from helpers import slow_robots
 from helpers.builders import tiny
 from helpers.forked import codetr
@@ -94,30 +93,6 @@ def test_a_run_all_of_which_is_killed_goes_on_and_gets_longer_and_has_the_same_w
     assert verify(folder / 'bag').sound
     assert summary['evaluations_missing'] == 0
     assert json.loads((folder / 'summary.json').read_text())['settings']['steps'] == 2400
-
-
-@pytest.mark.slow
-def test_a_run_is_gone_on_with_where_its_learner_was_ahead_of_the_recorder(tmp_path):
-    """It has learnt from the newest commit; the recorder has not received the permission before
-    the newest one.
-    """
-    settings = SETTINGS.changed(
-        {'overlap': True, 'steps': 4000, 'phase_steps': 100, 'evaluate_every': 0}
-    )
-    folder = tmp_path / 'run'
-    command = start(write(settings, folder), folder)
-    until(lambda: phase_of(folder) >= 3, command, folder)
-    log, learner = folder / 'logs' / 'record.log', node_of(folder, 'learner')
-    os.kill(learner, signal.SIGSTOP)
-    until(lambda: 'waits for permission' in log.read_text(), command, folder)
-    os.kill(node_of(folder, 'record'), signal.SIGSTOP)
-    os.kill(learner, signal.SIGCONT)
-    learnt = folder / 'checkpoints' / f'learner-{phase_of(folder) - 1:06}' / DESCRIPTION
-    until(learnt.is_file, command, folder)
-    kill(command, folder)
-    summary = resumed(folder)
-    assert weights(summary) == digests(settings)
-    assert verify(folder / 'bag').sound
 
 
 @pytest.mark.slow

@@ -1,6 +1,9 @@
-"""What a simulator asks the recorder for when it joins a run that has begun."""
+"""What a simulator asks the recorder for when it joins a run that has begun, and where a learner
+that was killed goes on.
+"""
 
 import logging
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,6 +11,7 @@ import pytest
 from codetr_ros.bags.definitions import decode, encode
 from codetr_ros.bags.topics import RECORDED, topics_of_run
 from codetr_ros.cores.simulator import Simulator
+from codetr_ros.nodes import restoring
 from codetr_ros.nodes.kept_run import KeptRun
 from codetr_ros.nodes.peers import Peers
 from codetr_ros.nodes.restoring import Returning, go_on, take_place
@@ -93,3 +97,30 @@ def test_an_announcement_belongs_to_the_phase_that_is_committed_next(kept):
         *announced, last = [decode(kind, data) for kind, data in kept.read(phase, kinds)]
         assert [each.source for each in announced] == sources
         assert last.phase == phase
+
+
+@pytest.mark.parametrize(('overlap', 'phase'), [(False, 5), (True, 4)])
+def test_a_learner_publishes_the_permission_again_that_a_killed_recorder_may_have_lost(
+    overlap, phase
+):
+    """That for phase 6 follows from phase 5, with overlap from phase 4: whatever later checkpoint
+    it has.
+    """
+    core = Resumes()
+    settings = tiny(overlap=overlap)
+    node = SimpleNamespace(
+        core=core, settings=settings, log=logging.getLogger(), catch_up=lambda newest: None
+    )
+    assert list(restoring._learner(node, 5)) == []
+    assert core.resumed == [phase]
+
+
+class Resumes:
+    """A core that has a checkpoint of each phase."""
+
+    def __init__(self):
+        self.resumed = []
+
+    def resume(self, phase):
+        self.resumed.append(phase)
+        return phase
