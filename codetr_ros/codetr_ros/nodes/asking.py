@@ -31,6 +31,11 @@ class Answer:
     reason: str = ''
     messages: list[tuple[type, bytes]] = field(default_factory=list)
 
+    @property
+    def nothing(self) -> bool:
+        """Whether nothing of what was asked for was sent."""
+        return bool(self.reason) or not self.messages
+
 
 Read = Callable[[int, Collection[str]], Iterable[tuple[type, bytes]]]
 """Kind and bytes of each message of a phase that is of a wanted type, of any if none is named.

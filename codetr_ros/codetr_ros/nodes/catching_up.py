@@ -95,7 +95,8 @@ class Fetcher:
         """Ask for what the core has lacked for a while."""
         now = self._clock()
         missing, unlabelled = core.missing, core.unlabelled
-        self._kinds = tuple(kind for kind in OF_PHASES if kind in core.subscribes)
+        if missing is not None:
+            self._kinds = tuple(kind for kind in OF_PHASES if kind in core.subscribes)
         known = missing is not None and (missing <= self.behind or missing in core.gone_by)
         if self._phases.due(missing, now, known):
             assert missing is not None
@@ -173,7 +174,7 @@ class Fetcher:
             self._recorder.ask(phase, lambda answer: self._offered_commit(phase, answer), kinds)
 
     def _offered_commit(self, phase: int, answer: Answer) -> None:
-        if answer.reason or not answer.messages:
+        if answer.nothing:
             self._commits.to_come(self._clock())  # it has not committed the phase yet
             return
         if self._committed.lost(phase, self._clock()):
@@ -203,7 +204,7 @@ class Fetcher:
             asker.ask(phase, lambda answer: self._offered_policy(phase, answer), kinds)
 
     def _offered_policy(self, phase: int, answer: Answer) -> None:
-        if answer.reason or not answer.messages:
+        if answer.nothing:
             self._ask_for_earlier(phase)  # it has not permitted the phase yet, or long ago
         elif self._permitted.lost(phase, self._clock()):
             self._take_all(answer, PERMISSION.format(phase))
@@ -217,7 +218,7 @@ class Fetcher:
             self._permissions.to_come(self._clock())
 
     def _recorded_policy(self, phase: int, answer: Answer) -> None:
-        if answer.reason or not answer.messages:
+        if answer.nothing:
             self._permissions.to_come(self._clock())
         else:
             self._take_all(answer, PERMISSION.format(phase))  # it was published long ago
@@ -246,7 +247,7 @@ class Fetcher:
             self._log.info(f'phase {phase}: {len(answer.messages)} messages came again')
 
     def _labelled(self, phase: int, answer: Answer) -> None:
-        if answer.reason or not answer.messages:
+        if answer.nothing:
             self._labels.to_come(self._clock())  # it has not labelled the phase yet
             return
         if phase <= self.behind or self._offered.lost(phase, self._clock()):

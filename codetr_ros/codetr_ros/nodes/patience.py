@@ -58,13 +58,10 @@ class InVain:
             asked_for: topics of what is asked for, and since when [s].
             now: monotonic time [s].
         """
+        before, self._lost = self._lost, {}
         for topic, count in lost.items():
-            before, _ = self._lost.get(topic, (0, now))
-            if topic not in self._lost or count < before:
-                self._lost[topic] = count, now
-            else:
-                self._lost[topic] = count, self._lost[topic][1]
-        self._lost = {topic: self._lost[topic] for topic in lost}
+            known, since = before.get(topic, (count, now))
+            self._lost[topic] = count, now if count < known else since
         return {
             topic: count
             for topic, (count, since) in self._lost.items()
