@@ -406,6 +406,31 @@ def test_true_rewards_that_come_behind_the_commits_are_no_fault(tmp_path):
     assert verify(ours(tmp_path / 'bag', late)).sound
 
 
+@pytest.mark.parametrize('phases', [0, 2], ids=['in the first phase', 'behind two phases'])
+def test_a_bag_may_end_anywhere_behind_its_last_commit(phases, tmp_path):
+    """Topics overtake each other: scores and true rewards may be there, their steps not yet."""
+    last = [n for n, each in enumerate(RUN) if isinstance(each, Commit)][phases]
+    end = [
+        each for each in RUN[:last] if not (isinstance(each, Transitions) and each.phase == phases)
+    ]
+    verdict = verify(ours(tmp_path / 'bag', end))
+    assert verdict.sound, verdict.findings.named
+    (run,) = verdict.runs.values()
+    assert (run.phases, run.whole) == (phases, phases)
+    assert any(
+        "scores and true rewards of 'sim' are of steps that" in r for r in verdict.findings.remarks
+    )
+
+
+def test_without_a_run_that_commits_scores_of_no_steps_are_a_fault(tmp_path):
+    """A bag that somebody recorded of a robot: nothing says where it may end."""
+    own = [r for r in RUN if not isinstance(r, (RunSpec, Commit))]
+    lacking = [r for r in own if not (isinstance(r, Transitions) and r.phase == 2)]
+    assert 'scores steps that the bag does not have' in ' '.join(
+        named(ours(tmp_path / 'bag', lacking))
+    )
+
+
 def proven(records):
     """The same records, with the digests that our recorder states in its commits."""
     chain, out = Chain(1), []

@@ -56,6 +56,21 @@ def test_it_has_finished_once_a_recorder_has_that_did_not_wait_for_it(simulator,
     assert behind.asks == (not settings_hash)
 
 
+def test_it_stops_in_the_midst_of_a_phase_once_the_run_is_over(simulator):
+    core, traffic, behind = simulator()
+    traffic.receive(permission(0))
+    work = core.work()
+    next(work)
+    chunk, *_ = next(work)
+    assert not chunk.phase_end
+    peers = Peers('sim')
+    peers.note(presence('record', finished=True), 0.0)
+    for _ in range(2):  # asked again, it is over still
+        assert behind.over(peers)
+    assert core.finished
+    assert core.report().counters['phases left out'] == SETTINGS.phases - 1
+
+
 def test_policies_that_nobody_can_have_published_yet_are_refused(simulator):
     core, traffic, behind = simulator()
     traffic.receive(permission(50))

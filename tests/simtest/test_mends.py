@@ -11,6 +11,7 @@ import pytest
 from codetr_ros.bags import reopening, writer
 from codetr_ros.cores import announced, held, intake, learner, recorder
 from codetr_ros.nodes import (
+    behind,
     catching_up,
     fetching,
     keeping,
@@ -29,7 +30,7 @@ from codetr_ros.simtest import disks, process
 from codetr_ros.simtest.disks import Trouble
 from codetr_ros.simtest.losing import losing
 from codetr_ros.simtest.network import Weather
-from codetr_ros.simtest.plan import Death, all_settings, plan
+from codetr_ros.simtest.plan import Death, all_settings, names_of, plan
 from codetr_ros.simtest.process import Pace
 from codetr_ros.simtest.run import carry_out, undisturbed
 from helpers.deaths import deadly
@@ -305,6 +306,14 @@ def end_before_what_was_missed_is_there(patch):
     patch.setattr(keeping.Keeping, 'go_on', go_on)
 
 
+def go_on_for_nobody(patch):
+    def over(self, peers):
+        return self._core.lacks_permission and real(self, peers)
+
+    real = behind.Behind.over
+    patch.setattr(behind.Behind, 'over', over)
+
+
 def forget_what_was_published(patch):
     def read(self, phase, kinds=()):
         raise KeyError(f'phase {phase} is not kept')
@@ -352,6 +361,7 @@ MENDS: dict[Callable, str] = {
     forget_what_was_published: 'gave up|not sound',
     end_before_what_was_missed_is_there: 'gave up|not sound',
     name_a_checkpoint_before_it_is_on_the_disk: 'has damaged a checkpoint',
+    go_on_for_nobody: 'stays for',
 }
 
 
@@ -416,6 +426,13 @@ def much_lost(planned):
     return losing(61 + planned.seed)  # so few fail
 
 
+def left_behind(planned):
+    """The same run, one of whose simulators is so slow that it is left out."""
+    settings = all_settings()[5]
+    paces = {name: Pace() for name in names_of(settings)} | {'sim_2': Pace(slice_seconds=4.0)}
+    return replace(lossy(planned), settings=settings, paces=paces, leave_out_after=2.0)
+
+
 def crowded(planned):
     """The same run, but that some never reaches the recorder, and strangers publish a lot."""
     return replace(planned, weather=replace(planned.weather, overrun=0.05, strangers=0.3))
@@ -443,6 +460,7 @@ PLANS = {
     forget_what_was_published: deadly,
     end_before_what_was_missed_is_there: killed_at_the_end,
     name_a_checkpoint_before_it_is_on_the_disk: cut_off,
+    go_on_for_nobody: left_behind,
 }
 """What is rare among the seeds is planned."""
 

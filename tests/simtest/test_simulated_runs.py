@@ -17,7 +17,7 @@ from codetr_ros.simtest.run import carry_out, simulate
 from helpers.slow_runs import far_apart, slow_and_losing
 
 QUICK, MANY = range(24), range(24, 120)
-FOUND = (43, 247, 475, 583, 792, 821, 50070, 50636)
+FOUND = (43, 247, 475, 583, 792, 821, 1604, 5709, 5733, 50070, 50636, 53873)
 """Seeds beyond those that once failed."""
 LOSING = (110, 128, 136, 176, 213, 217, 219, 260)
 """Likewise, where much is lost and nodes are killed: a node gave up on what it did not need or on

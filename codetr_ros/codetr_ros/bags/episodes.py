@@ -5,7 +5,7 @@ Memory: twelve bytes for each episode, and whatever still waits for its counterp
 
 from array import array
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,7 @@ class Numbers:
         self.whose = whose
         self.next = 0
         self.whole = 0  # no number below this one is missing
+        self.committed = -1  # last one that a commit has named
         self._findings = findings
 
     def take(self, sequence: int, place: Any) -> bool:
@@ -117,13 +118,13 @@ class SourceChecks:
         self.elsewhere = elsewhere
         self.spec: TaskSpec | None = None
         self.numbers = Numbers(f'transitions of {name!r}', findings)
-        self.committed = -1  # last sequence number that a commit has named
         # phase -> sequence number of its last chunk, until committed
         self.ends: dict[int, int] = {}
         self.steps = 0
         self.steps_dropped = 0
         self.phases_dropped = 0
         self.scored = 0
+        self.ahead = 0  # scores and true rewards whose steps were to be committed later
         self._findings = findings
         self._lengths = array('I')  # steps of each episode so far
         self._until = array('I')  # steps of each episode up to the end of its last scored segment
@@ -296,9 +297,14 @@ class SourceChecks:
                 f'of that number have {chunk}',
             )
 
+    @property
+    def committed(self) -> int:
+        """The last sequence number that a commit has named; -1 before."""
+        return self.numbers.committed
+
     def commit(self, last: int) -> None:
         """Everything up to this sequence number belongs to the phases committed so far."""
-        self.committed = max(self.committed, last)
+        self.numbers.committed = max(self.committed, last)
         if not self._has_true:
             for sequence in [n for n in self._chunks if n <= last]:
                 del self._chunks[sequence]
@@ -309,8 +315,15 @@ class SourceChecks:
         episode, first, length = span
         return episode < len(self._lengths) and first + length <= self._lengths[episode]
 
-    def finish(self, commits: bool, place: Any) -> None:
-        """Report what never came. In a bag with commits, only what they name counts."""
+    def finish(self, scorers: Mapping[str, Numbers] | None, place: Any) -> None:
+        """Report what never came. Where a recorder commits phases, only what commits name counts:
+        a bag may end anywhere behind the last of them.
+
+        Args:
+            scorers: the numbers of each scorer, by its name; None: nothing is ever committed.
+            place: of the bag.
+        """
+        commits = scorers is not None
         for (episode, first, length), (sequence, where) in self._due.items():
             if not commits or sequence <= self.committed:
                 self._findings.add(
@@ -320,12 +333,18 @@ class SourceChecks:
                     f'{first + length - 1}, has no composite reward',
                 )
         for reward, where in self._early:
-            self._homeless(reward, where)
+            if scorers and reward.sequence > scorers[reward.scorer].committed:
+                self.ahead += 1
+            else:
+                self._homeless(reward, where)
         for sequence in self._without_true(commits):
             self._findings.add(
                 'record', place, f'transitions {sequence} of {self.name!r} have no true rewards'
             )
         for sequence, (_, where) in self._true.items():
+            if commits and sequence > self.committed:
+                self.ahead += 1
+                continue
             self._findings.add(
                 'record', where, f'true rewards {sequence} of {self.name!r} have no transitions'
             )

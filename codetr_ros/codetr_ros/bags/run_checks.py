@@ -255,6 +255,8 @@ class RunChecks:
                 continue
             there = self._scorers.get(name)
             whole &= self._named('composite rewards', name, last, there, record.phase, place)
+            if there is not None:
+                there.committed = max(there.committed, last)
         self.whole += whole
         self._digests(record, place)
 
@@ -342,17 +344,23 @@ class RunChecks:
             self._commit(*commit)
         for numbers in self._scorers.values():
             numbers.finish(place)
+        commits = self.phases > 0 or (self._run is not None and self._ordered)
         for source in self.sources.values():
-            source.finish(self.phases > 0, place)
+            source.finish(self._scorers if commits else None, place)
             if source.phases_dropped:
                 self._findings.remarks.append(
                     f'{self.name}: {source.name!r} was left out of {source.phases_dropped} phases '
                     f'in which it had steps to take; {source.steps_dropped} that came were dropped'
                 )
-            if self.phases and source.tail:
+            if commits and source.tail:
                 self._findings.remarks.append(
                     f'{self.name}: the last {source.tail} transitions of {source.name!r} are of a '
                     'phase that was not committed'
+                )
+            if source.ahead:
+                self._findings.remarks.append(
+                    f'{self.name}: {source.ahead} scores and true rewards of {source.name!r} are '
+                    'of steps that the bag does not have, of a phase that was not committed'
                 )
             if self._cuts is None and source.steps > source.scored:
                 self._findings.remarks.append(

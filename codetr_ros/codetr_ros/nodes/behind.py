@@ -49,16 +49,18 @@ class Behind:
         return bool(self._held) and self._core.lacks_permission
 
     def over(self, peers: Peers) -> bool:
-        """Whether the run is over: the recorder has finished, and did not wait for this simulator.
-        It then has nothing more to do, and nobody answers it any more.
+        """Whether the run is over: the recorder has finished, and need not have waited for this
+        simulator. It then has nothing more to do, even in the midst of a phase: nobody takes its
+        steps, and nobody answers it.
 
         Args:
             peers: the other nodes.
         """
-        if self._settings.alone or self._core.finished or not peers.recorded():
+        if self._settings.alone or not peers.recorded():
             return False
-        self._held = {}
-        self._core.pass_over(self._settings.phases)
+        if not self._core.finished:
+            self._held = {}
+            self._core.pass_over(self._settings.phases)
         return True
 
     def answered(self, newest: int | None) -> None:

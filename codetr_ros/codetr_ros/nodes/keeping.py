@@ -42,7 +42,8 @@ from codetr_ros.records.roles import ROLES, WRITERS
 RECORDED_TOPICS = [TOPICS[kind] for kind in RECORDED]
 CATCH_UP = 10.0
 """The most seconds that a recorder which was held takes to ask others for what it has missed. They
-keep it for some phases only, so that it commits none meanwhile."""
+keep it for some phases only, so that it commits none meanwhile. One that was killed, and comes to
+the end of the run, waits for their answers as long as it waits for anybody."""
 ASKS_ALL = (5.0, 30.0)
 """For how long [s] all others have waited when all of them are asked for what is lacking; behind
 that it is nothing that they have."""
@@ -146,7 +147,7 @@ class Keeping:
         if self._bag.gone_on:
             self._traffic.ledger.forgive()
             self._sweeper.ask(self._nodes())
-            self._missed_until = self._by.clock() + CATCH_UP
+            self._missed_until = self._by.clock() + max(CATCH_UP, self._by.limit.seconds)
 
     def _nodes(self, roles: Collection[str] = ROLES) -> list[str]:
         """Full names of the other nodes of these roles."""

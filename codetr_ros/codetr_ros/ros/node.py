@@ -102,7 +102,8 @@ class Node:
             member.turn()
             self._sound = False  # until the slice has ended well
             try:
-                given = None if member.runs_away else self._slice(work, worked)
+                idle = member.runs_away or wiring.over()
+                given = None if idle else self._slice(work, worked)
             except Stopped:
                 return
             for each in given or ():

@@ -23,15 +23,16 @@ class Simulating(Wiring):
 
     def waits(self) -> str:
         """What the simulator waits for, in words. If it was left out meanwhile, it goes on where
-        the run stands, or has finished if the run has.
+        the run stands.
         """
         member, joined = self.member, self.joined
-        if not self._over() and self._behind.asks:
+        if self._behind.asks:
             asked = newest_committed(self._behind.answered)
-            ask_recorder(member, joined, asked, self._over)
+            ask_recorder(member, joined, asked, self.over)
         if not self._core.finished and self._core.displaced:
-            ask_recorder(member, joined, take_place(returning(member, joined)), self._over)
+            ask_recorder(member, joined, take_place(returning(member, joined)), self.over)
         return super().waits()
 
-    def _over(self) -> bool:
+    def over(self) -> bool:
+        """Whether the run has ended without it: a robot need not go on for nobody."""
         return self._behind.over(self.member.peers)

@@ -88,6 +88,10 @@ class Wiring:
             self._course.note(each)
         self._course.tick(doing)
 
+    def over(self) -> bool:
+        """Whether the run has ended without this node, which has then finished wherever it is."""
+        return False
+
     def held(self) -> None:
         """Note that the process was held, and has read nothing for a while."""
 

@@ -135,8 +135,6 @@ def _unrecorded(run: 'Simulated') -> Iterator[str]:
 def _bag(run: 'Simulated', whole: bool) -> Iterator[str]:
     """The bag holds what was learnt from, and is sound if the run has finished."""
     allowed = set() if whole else {'metadata', 'index'}
-    if not whole and _unheard(run):
-        allowed |= {'segment', 'record'}  # of steps that never reached it
     if not run.recording.opened:
         allowed.add('file')  # its disk failed before the bag was made, or made whole again
     try:

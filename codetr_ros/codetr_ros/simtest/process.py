@@ -271,7 +271,7 @@ class Process:
         runs_away = self._fetcher.runs_away(self.core, self._outbox)
         if not runs_away:
             self._fetcher.check(self.core)
-        given = None if runs_away else next(self._work)
+        given = None if runs_away or self._over() else next(self._work)
         for record in given or ():
             self.deliver(record)
         if given is not None:
@@ -293,11 +293,9 @@ class Process:
 
     def waits(self) -> str:
         """What the node waits for, in words. A simulator that was left out goes on where the run
-        stands, or has finished if the run has.
+        stands.
         """
-        if self._over():
-            pass
-        elif self._behind is not None and self._behind.asks:
+        if self._behind is not None and self._behind.asks:
             self._restore(newest_committed(self._behind.answered))
         elif isinstance(self.core, Simulator) and self.core.displaced:
             self._restore(take_place(self._returning()))
