@@ -30,6 +30,7 @@ def memory(
     noise: float = 0.0,
     irregular: bool = False,
     components: int = O,
+    terminated: bool = False,
 ) -> Trajectories:
     """One episode of whole segments, the step rewards in it too.
 
@@ -42,6 +43,7 @@ def memory(
         noise: deviation of what is added to each step's reward.
         irregular: lengths are drawn from half the delay on.
         components: of an observation, O.
+        terminated: the episode ends in a terminal state.
     """
     rng = np.random.default_rng(seed)
     lengths = np.full(segments, delay)
@@ -62,7 +64,11 @@ def memory(
     )
     made.append(
         builders.transitions(
-            steps=steps, observations=observations, actions=actions, truncated=True
+            steps=steps,
+            observations=observations,
+            actions=actions,
+            terminated=terminated,
+            truncated=not terminated,
         )
     )
     made.append_true_rewards(

@@ -10,7 +10,7 @@ from scipy.stats import norm
 from codetr_ros.memory.trajectories import Trajectories
 from codetr_ros.records import F64
 from codetr_ros.rewards import registry
-from codetr_ros.rewards.base import RewardModelError
+from codetr_ros.rewards.base import RewardModelError, segment_steps
 from codetr_ros.rewards.evidence import links, saving
 from codetr_ros.rewards.evidence.method import Evidence
 from codetr_ros.rewards.evidence.model import Model, Targets
@@ -211,6 +211,7 @@ def test_a_robot_that_falls_soon_gets_no_better_steps_than_one_that_stands(kind)
         lambda r: 1.0 + float(np.searchsorted(edges, composite(kind, r, 3.0, 10))),
         irregular=True,
         segments=120,
+        terminated=True,  # it falls
     )
     made = fitted(data, composite=kind)
     ids = data.segments.all_ids()
@@ -238,6 +239,37 @@ def test_predicted_verdicts_agree_with_those_given():
     predicted = made.predict(batch)
     assert predicted.min() >= 1 and predicted.max() <= 4
     assert np.corrcoef(predicted, batch.values)[0, 1] > 0.8
+
+
+def labels_of(made: Evidence, data: Trajectories) -> F64:
+    batch = data.segments.batch(data.segments.ids(), made.context)
+    return made.label(batch)[segment_steps(batch)].astype(np.float64)
+
+
+@pytest.mark.parametrize('kind', ['sum', 'max'])
+def test_stars_are_no_rewards_by_themselves_unless_episodes_end_in_terminal_states(kind):
+    """Where all steps have something positive in common, SAC learns that first."""
+    edges = LOPSIDED if kind == 'sum' else np.array([-0.5, 0.0, 0.5, 2.0])
+    time, terminal = (stars(kind, edges, segments=80, terminated=t) for t in (False, True))
+    around, positive = (fitted(data, composite=kind) for data in (time, terminal))
+    labels, as_numbers = labels_of(around, time), labels_of(positive, terminal)
+    assert abs(labels.mean()) < 0.1 * labels.std()
+    assert as_numbers.mean() > 0.5 * as_numbers.std()
+    assert_allclose(labels - labels.mean(), as_numbers - as_numbers.mean(), atol=1e-5)
+    batch = time.segments.batch(time.segments.ids(), around.context)
+    assert_allclose(around.predict(batch), positive.predict(batch), rtol=1e-6)
+
+
+def test_a_model_that_was_saved_before_labels_had_a_zero_goes_on_as_it_was():
+    data = stars('sum', LOPSIDED, segments=60)
+    made = fitted(data)
+    zero = made.model.zero * made.model.scale / made.unit
+    old = {name: tensor for name, tensor in made.state().items() if name != 'zero'}
+    again = registry.make(builders.tiny(**SETTINGS), O, A)
+    assert isinstance(again, Evidence)
+    again.load_state(old)
+    assert zero > 0
+    assert_allclose(labels_of(again, data), labels_of(made, data) + zero, atol=1e-5)
 
 
 def test_a_scale_that_is_saved_and_loaded_is_the_same_and_goes_on():

@@ -37,6 +37,7 @@ class StoredEpisode:
     order: int  # episodes leave the memory in the order in which they came
     steps: int = 0
     ended: bool = False
+    terminal: bool = False  # it ended in a terminal state
 
 
 class SourceRing:
@@ -111,6 +112,7 @@ class SourceRing:
         self.end += chunk.steps
         episode.steps += chunk.steps
         episode.ended = chunk.terminated or chunk.truncated
+        episode.terminal = chunk.terminated
         self.finals[self.end - 1] = chunk.observations[-1].copy()
         self.last[rows[-1]] = True
         self.terminated[rows[-1]] = chunk.terminated

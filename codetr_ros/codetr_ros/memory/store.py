@@ -126,6 +126,11 @@ class Store:
     # reading
 
     @property
+    def terminates(self) -> bool:
+        """Whether an episode that it holds has ended in a terminal state."""
+        return any(each.terminal for source in self._sources.values() for each in source.episodes)
+
+    @property
     def sources(self) -> list[SourceRing]:
         """Each source's steps, in the order in which the sources sent the first of them."""
         return list(self._sources.values())

@@ -51,6 +51,7 @@ CLOSE = 0.05
 """Of the likeliest link's probability: from such a share on the next one is mixed in."""
 SECOND = 'second.'
 """What the names of that one's tensors begin with."""
+ZEROS = ('zero', SECOND + 'zero')
 NEWEST, NEWEST_STEPS = 64, 1000
 """The newest segments, and their steps, of which metrics state how sure the fit is."""
 SHOWN = 5
@@ -423,7 +424,10 @@ class Evidence(Predictor):
             RewardModelError: it is another method's or task's; nothing has changed then.
         """
         settings, features = self._settings, self._features
-        check_state(f'reward method {self.name!r}', self.state(), state, RewardModelError)
+        own = self.state()
+        # a model that was saved before there was one took every label for what it is
+        state = {name: torch.zeros_like(own[name]) for name in own if name in ZEROS} | dict(state)
+        check_state(f'reward method {self.name!r}', own, state, RewardModelError)
         how = (features.blocks, settings.beta, settings.longest)
         marked = {name: state[name] for name in state if name.startswith(SECOND)}
         other = {name.removeprefix(SECOND): tensor for name, tensor in marked.items()}

@@ -93,6 +93,14 @@ class Model:
         """Of levels of these scores, each predicted from all others."""
         self.verdicts: Verdicts | None = None
         """The scale of the scores, where it is ordinal."""
+        self.zero = 0.0
+        """The step reward that labels take for nothing. Where scores are verdicts it is the mean
+        of the steps that were judged, as no verdict is zero by itself: stars are positive numbers,
+        and SAC, whose values begin at zero, would have to learn what all steps have in common
+        before it can tell actions apart. That changes no policy's rank as long as episodes end by
+        time alone. Where some end in a terminal state, it decides whether it pays to live on, and
+        verdicts stay the numbers that they are.
+        """
 
     def measure(self, scores: F64, m: I64, ordinal: bool) -> None:
         """Note what scores are, and freeze the unit of levels, the first time.
@@ -134,14 +142,22 @@ class Model:
         levels = self.link.level(sample.scores, sample.m) / self.scale
         if duels is not None:
             self._fit_duels(sample, levels, some, duels, ordinal)
-            return
-        if ordinal:
+        elif ordinal:
             self._fit_verdicts(sample, levels, some)
-            return
-        self.verdicts = None
-        self._fit(sample, Targets(levels), some)
-        slopes = self.link.log_slope(sample.scores, sample.m)[some]
-        self.evidence += float(slopes.sum()) - len(some) * math.log(self.scale)
+        else:
+            self.verdicts = None
+            self._fit(sample, Targets(levels), some)
+            slopes = self.link.log_slope(sample.scores, sample.m)[some]
+            self.evidence += float(slopes.sum()) - len(some) * math.log(self.scale)
+        judged = ordinal and len(sample.m) > 0 and not sample.terminates
+        self.zero = self._mean_reward(sample) if judged else 0.0
+
+    def _mean_reward(self, sample: Sample) -> float:
+        """The mean step reward that the posterior mean lets expect."""
+        if self.link.linear:
+            means: F64 = (sample.means() @ self.posterior.mean).numpy()
+            return float(np.average(means, weights=sample.m))
+        return float(of_steps(sample.steps(), self.posterior.mean).mean())
 
     def _fit_duels(
         self, sample: Sample, levels: F64, some: I64, duels: Duels, ordinal: bool
@@ -383,7 +399,8 @@ class Model:
         return value, evidence.left_out(self.theta)
 
     def labels(self, f: F64, scores: F64, m: I64) -> F64:
-        """Step rewards (N,) that explain the scores, in units of `scale`; f without a score.
+        """Step rewards (N,) that explain the scores, in units of `scale`; f without a score. From
+        all of them `zero` is taken off.
 
         Args:
             f: (N,) of the segments' steps, one segment after the other.
@@ -393,7 +410,7 @@ class Model:
         missing = np.isnan(scores)
         level = self.due(f, np.where(missing, 0.0, scores), m)
         shift = self.link.shift(f, level, np.cumsum(m) - m, m)
-        labels: F64 = f + np.repeat(np.where(missing, 0.0, shift), m)
+        labels: F64 = f - self.zero + np.repeat(np.where(missing, 0.0, shift), m)
         return labels
 
     def due(self, f: F64, scores: F64, m: I64) -> F64:

@@ -40,6 +40,7 @@ class Sample:
     scores: F64  # (S,)
     m: I64  # (S,) steps
     rows: Tensor  # features: (S, D) float64, segments' means, or (N, D) float32, of all steps
+    terminates: bool = False  # some episode in the memory has ended in a terminal state
 
     @property
     def starts(self) -> I64:
@@ -49,7 +50,8 @@ class Sample:
 
     def part(self, places: I64) -> 'Sample':
         """Some of the segments, of a sample without single steps."""
-        return Sample(self.scores[places], self.m[places], self.rows[torch.tensor(places)])
+        rows = self.rows[torch.tensor(places)]
+        return Sample(self.scores[places], self.m[places], rows, self.terminates)
 
     def steps(self) -> Tensor:
         """Features (N, D) of all steps, for links that ask for them."""
@@ -142,10 +144,11 @@ class Sampler:
         scores, m = memory.segments.scores(ids), memory.segments.lengths(ids)
         if steps:
             self._steps = _kept(self._steps, ids, lambda new: self._each(memory, new, self._rows))
-            return Sample(scores, m, torch.cat(list(self._steps.values())))
+            rows = torch.cat(list(self._steps.values()))
+            return Sample(scores, m, rows, memory.store.terminates)
         self._steps = {}  # a hundred times as large: not kept for a link that does without
         self._means = _kept(self._means, ids, lambda new: self._each(memory, new, self._mean))
-        return Sample(scores, m, torch.stack(list(self._means.values())))
+        return Sample(scores, m, torch.stack(list(self._means.values())), memory.store.terminates)
 
     def _added(self, inputs: F32) -> F64:
         return sums(inputs[:, : self._features.inputs])

@@ -24,6 +24,7 @@ def saved(model: Model) -> dict[str, Tensor]:
         'beta_log_ratio': soft.log_ratio if soft else 0.0,
         'verdict_noise': 0.0,
         'verdict_spread': 0.0,
+        'zero': model.zero,
     }
     counts = {
         'link': links.NAMES.index(model.link.name),
@@ -79,6 +80,7 @@ def restored(
     model.evidence = float(state['evidence'])
     model.left_out_r2 = float(state['left_out_r2'])
     model.fitted = bool(state['fitted'])
+    model.zero = float(state['zero'])
     count = int(state['verdict_values'])
     if not 0 <= count <= MOST_VALUES:
         raise ValueError(f'verdict_values = {count}: an ordinal scale has 2 to {MOST_VALUES}')
