@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from codetr_ros import config
 from codetr_ros.cli import (
@@ -35,9 +35,7 @@ from codetr_ros.processes import launcher
 from codetr_ros.processes.launcher import LaunchError
 from codetr_ros.processes.openmp import crowded, threading_environment
 from codetr_ros.processes.restarts import Restarts
-from codetr_ros.processes.supervise import (
-    Interrupts,
-)
+from codetr_ros.processes.supervise import Interrupts
 from codetr_ros.runs import folder as run_folder
 from codetr_ros.runs import origin
 from codetr_ros.runs.folder import RunFolderError
@@ -46,11 +44,9 @@ from codetr_ros.runs.middle import Middle
 from codetr_ros.runs.origin import Origin, held
 from codetr_ros.runs.progress import Progress
 from codetr_ros.runs.report_text import evaluations_missing
+from codetr_ros.runs.run_summary import RunSummary
 from codetr_ros.runs.summary import Summary
 from codetr_ros.runs.tensorboard import Events
-
-if TYPE_CHECKING:
-    pass
 
 DESCRIPTION = """Train on a task.
 
@@ -218,37 +214,25 @@ def train(
     settings = config.settled(settings)
     in_process = topics is None
     namespace = None if topics is None else topics.namespace or launcher.namespace_of(run_id)
-    notes: list[str] = []
+    recorded = bag or not in_process
     try:
         if begun is not None:
             notes = [] if in_process else resume.prepare(settings, run_id, folder)
             notes += resume.begin(folder, begun, settings)
             run_folder.forget_reports(folder)
         else:
-            run_folder.begin_anew(folder)
             where = namespace or launcher.namespace_of(run_id)
-            recorded = bag or not in_process
-            origin.write(
-                folder, origin.origin(settings, run_id, where, in_process, recorded, command)
-            )
-            run_folder.write_settings(folder, settings)  # the last: from now on it can go on
+            made = origin.origin(settings, run_id, where, in_process, recorded, command)
+            notes = []
+            _begin(folder, settings, made)
     except (OSError, RunFolderError) as error:
         return refuse(str(error))
     recorded_before = True if begun is not None else None
     summary = Summary(settings, run_id, in_process, command=command, recorded=recorded_before)
     progress = Progress(settings)
-    live = Live(folder, summary, progress, namespace, recorded=bag or not in_process)
-    progress.log(
-        f'{settings.task}: {settings.composite} of {config.delay_in_words(settings.delay)}, '
-        f'method {settings.method}, {settings.steps} steps, seed {settings.seed}'
-        + (', in process' if topics is None else '')
-        + (', gone on with' if begun is not None else '')
-    )
-    progress.log(f'output: {results.short(folder)}')
-    for note in notes:
-        progress.log(note)
-    if reason := crowded(settings.thread_count, os.getloadavg()[0]):
-        progress.log(reason)
+    live = Live(folder, summary, progress, namespace, recorded=recorded)
+    how = ', in process' * in_process + ', gone on with' * (begun is not None)
+    _introduce(progress, settings, how, folder, notes)
     if namespace is not None:
         progress.log(f'namespace: {namespace}')
         for line in how_to_join(settings, namespace):
@@ -272,31 +256,61 @@ def train(
             outcome = way(settings, run_id, folder, audience, interrupts)
         if outcome.refused:
             return refuse(outcome.refused)
-        live.end('ending')
-        place = folder / run_folder.BAG
-        built = summary.build(
-            outcome.reports,
-            place if place.is_dir() else None,
-            outcome.interrupted,
-            outcome.failure,
-        )
-        if built.evaluations_missing and not outcome.interrupted:
-            progress.log(f'warning: {evaluations_missing(built)}')
-        try:
-            audience.end()
-            draw = shown.film and not outcome.interrupted and not outcome.failure
-            if draw:
-                progress.log('drawing the robot for the report')
-            results.write(folder, summary, built, draw)
-        except OSError as error:
-            outcome.failure = '; '.join(filter(None, (outcome.failure, str(error))))
-        live.end(outcome.state, outcome.failure)
+        built = _write_results(folder, outcome, audience, shown.film)
     results.show(built, folder, console(tables=True))
     if outcome.failure:
         show_failure(outcome)
     if outcome.interrupted:
         return INTERRUPTED
     return FAILED if outcome.failure else 0
+
+
+def _begin(folder: Path, settings: Settings, made: Origin) -> None:
+    """Write into a folder what a run goes on from, if it does not end.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    run_folder.begin_anew(folder)
+    origin.write(folder, made)
+    run_folder.write_settings(folder, settings)  # the last: from now on it can go on
+
+
+def _introduce(
+    progress: Progress, settings: Settings, how: str, folder: Path, notes: Sequence[str]
+) -> None:
+    """Log what begins, where it goes, and what people should know before."""
+    progress.log(
+        f'{settings.task}: {settings.composite} of {config.delay_in_words(settings.delay)}, '
+        f'method {settings.method}, {settings.steps} steps, seed {settings.seed}{how}'
+    )
+    progress.log(f'output: {results.short(folder)}')
+    for note in notes:
+        progress.log(note)
+    if reason := crowded(settings.thread_count, os.getloadavg()[0]):
+        progress.log(reason)
+
+
+def _write_results(folder: Path, outcome: Outcome, audience: Audience, film: bool) -> RunSummary:
+    """Write the summary and the report of a run that has ended; what fails then is its failure."""
+    summary, progress, live = audience.summary, audience.progress, audience.live
+    live.end('ending')
+    place = folder / run_folder.BAG
+    built = summary.build(
+        outcome.reports, place if place.is_dir() else None, outcome.interrupted, outcome.failure
+    )
+    if built.evaluations_missing and not outcome.interrupted:
+        progress.log(f'warning: {evaluations_missing(built)}')
+    try:
+        audience.end()
+        draw = film and not outcome.interrupted and not outcome.failure
+        if draw:
+            progress.log('drawing the robot for the report')
+        results.write(folder, summary, built, draw)
+    except OSError as error:
+        outcome.failure = '; '.join(filter(None, (outcome.failure, str(error))))
+    live.end(outcome.state, outcome.failure)
+    return built
 
 
 def show_failure(outcome: Outcome) -> None:
