@@ -3,13 +3,14 @@
 Each mend is a name, a function that takes it out, and words of the failure by which it is found.
 """
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 
 from codetr_ros.bags import reopening, writer
-from codetr_ros.cores import announced, held, intake, learner, recorder
+from codetr_ros.cores import announced, arrived, held, intake, learner, recorder
 from codetr_ros.nodes import (
     behind,
     catching_up,
@@ -45,18 +46,18 @@ def accept_duplicates(patch):
         due[name] = max(due[name], record.sequence + 1)
         return True
 
-    patch.setattr(recorder.Recorder, '_next', taken)
+    patch.setattr(arrived.Arrived, '_next', taken)
 
 
 def accept_gaps(patch):
     def taken(self, record, due, name):
         if record.sequence < due[name]:
-            self.duplicated[TOPICS[type(record)]] += 1
+            self._duplicated[TOPICS[type(record)]] += 1
             return False
         due[name] = record.sequence + 1
         return True
 
-    patch.setattr(recorder.Recorder, '_next', taken)
+    patch.setattr(arrived.Arrived, '_next', taken)
     patch.setattr(recorder.Recorder, 'comes_early', lambda self, record: False)
 
 
@@ -88,14 +89,13 @@ def train_before_the_commit(patch):
 
 def commit_without_scores(patch):
     def whole(self, phase):
-        scores, self._scores = (
-            self._scores,
-            self._committed_scores + recorder.Counter(dict.fromkeys(self._scores, 10**6)),
-        )
+        there = self._arrived
+        scores, far = there._scores, Counter(dict.fromkeys(there._scores, 10**6))
+        there._scores = there._committed_scores + far
         try:
             return real(self, phase)
         finally:
-            self._scores = scores
+            there._scores = scores
 
     real = recorder.Recorder._whole
     patch.setattr(recorder.Recorder, '_whole', whole)
@@ -104,7 +104,7 @@ def commit_without_scores(patch):
 def commit_half_a_phase(patch):
     def whole(self, phase):
         members = self._permitted.get(phase)
-        return bool(members) and any((phase, source) in self._ended for source in members)
+        return bool(members) and any((phase, source) in self._arrived._ended for source in members)
 
     patch.setattr(recorder.Recorder, '_whole', whole)
 

@@ -8,9 +8,7 @@ The core knows nothing of bags. Its wiring writes every received record to disk 
 a `Commit`. So no record that a node learns from is ever lost.
 """
 
-import logging
 import time
-from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator
 from typing import Any
 
@@ -18,8 +16,9 @@ import numpy as np
 
 from codetr_ros.config import Settings
 from codetr_ros.cores.announced import Tasks
+from codetr_ros.cores.arrived import Arrived
 from codetr_ros.cores.core import Part
-from codetr_ros.cores.left_out import LeftOut, voided
+from codetr_ros.cores.left_out import LeftOut
 from codetr_ros.cores.recorded_labels import RecordedLabels
 from codetr_ros.records import (
     TOPICS,
@@ -36,7 +35,7 @@ from codetr_ros.records import (
     describe,
     metrics,
 )
-from codetr_ros.records.chain import Chain, publisher
+from codetr_ros.records.chain import Chain
 from codetr_ros.records.checks import (
     check_labels,
     check_preference,
@@ -45,10 +44,7 @@ from codetr_ros.records.checks import (
     check_scorer,
 )
 from codetr_ros.records.digests import digest
-from codetr_ros.records.numbering import Judgement, Numbering
 from codetr_ros.runs.reports import CoreReport
-
-_log = logging.getLogger(__name__)
 
 STATED = ('transition_digests', 'score_digests', 'policy_digest', 'previous')
 """Digests that a commit in a bag states, and that its records must have."""
@@ -81,15 +77,9 @@ class Recorder(Part):
         self._permission = 0  # the phase of the next policy
         self._chain = Chain(None if settings.free else settings.lag)
         self._labels = RecordedLabels(settings, self._chain)
-        self._steps: Counter[tuple[int, str]] = Counter()  # (phase, source)
-        self._ended: dict[tuple[int, str], tuple[int, int]] = {}  # -> last sequence, scores due
-        self._transitions: Counter[str] = Counter()  # next sequence number of each source
-        self._scores: Counter[str] = Counter()  # next sequence number of each scorer
-        self._numbers: defaultdict[str, Numbering] = defaultdict(Numbering)
-        self._committed_scores: Counter[str] = Counter()
+        self._arrived = Arrived(settings, self._chain, self.duplicated)
         self._left_out = LeftOut(settings)
         self._absent = set(settings.joining_sources)  # not there yet, or left out
-        self._counters: Counter[str] = Counter()
         self.refused = self._tasks.refused
         self.phase = 0  # the next to be committed
 
@@ -110,18 +100,15 @@ class Recorder(Part):
             self._check_permission(record)
             self._permit(record)
         elif isinstance(record, Transitions):
-            if self._tasks.admit(record) and self._next(record, self._transitions, record.source):
-                self._chain.note(record)
-                self._steps[record.phase, record.source] += record.steps
-                if record.phase_end:
-                    self._ended[record.phase, record.source] = (record.sequence, record.scores_due)
+            if self._tasks.admit(record):
+                self._arrived.transitions(record)
         elif isinstance(record, CompositeReward):
             check_score(record, self._settings.scored_at_most, self._settings.may_lack_scores)
             check_scorer(record, self._settings)
             if self._settings.scored_elsewhere:
-                self._judged(record)
-            elif self._next(record, self._scores, record.scorer):
-                self._chain.note(record)
+                self._arrived.judgement(record)
+            else:
+                self._arrived.score(record)
         elif isinstance(record, Preference):
             check_preference(record, self._settings.scored_at_most)
             # no name in `scorers` would let anybody compare there
@@ -131,32 +118,11 @@ class Recorder(Part):
                     'so nobody compares; start the run with scorer=topic'
                 )
             check_scorer(record, self._settings)
-            self._judged(record)
+            self._arrived.judgement(record)
         elif isinstance(record, StepRewards):
             check_labels(record, self._settings)
             if not self._labels.take(record, self.phase):
                 self.duplicated[TOPICS[StepRewards]] += 1
-
-    def _judged(self, record: Judgement) -> None:
-        """Note a judgement; its scorer's earlier ones may still be on their way."""
-        name, numbers = record.scorer, self._numbers[record.scorer]
-        most = self._committed_scores[name] + self._settings.judgements_ahead
-        if record.sequence >= most:
-            raise RecordError(
-                f'{describe(record)} is out of sequence: {numbers.next} is the next of {name!r}, '
-                f'and a scorer may give {self._settings.judgements_ahead} judgements between two '
-                'commits. Number them from 0 on, without gaps'
-            )
-        if not numbers.take(record.sequence):
-            self._repeated(record)
-            return
-        self._chain.note(record)
-        if len(numbers.early) == 1 and record.sequence in numbers.early:
-            _log.warning(
-                '%s of %r waits for number %s, which has not arrived: nothing is learnt from it '
-                'before', describe(record), name, numbers.next,
-            )  # fmt: skip
-        self._scores[name] = numbers.next
 
     def _check_permission(self, policy: Policy) -> None:
         """Refuse a policy that permits a phase again, or other steps than each source's share.
@@ -200,14 +166,14 @@ class Recorder(Part):
             The names of those that are left out now and were not before.
         """
         members = self._members(self.phase)
-        there = any(self._there(self.phase, source, n) for source, n in members.items())
+        there = any(self._arrived.all_of(self.phase, source, n) for source, n in members.items())
         if not self._tasks.known or not there:
             return []
         new = [
             source
             for source, steps in members.items()
             if source in sources
-            and not self._there(self.phase, source, steps)
+            and not self._arrived.all_of(self.phase, source, steps)
             and not self._left_out.is_out(source, self.phase)
         ]
         self._left_out.leave_out(new, self.phase)
@@ -282,43 +248,14 @@ class Recorder(Part):
         None if they may come in any order.
         """
         settings = self._settings
-        if isinstance(record, Transitions):
-            due, number = self._transitions[record.source], record.sequence
-        elif isinstance(record, CompositeReward) and not settings.scored_elsewhere:
-            due, number = self._scores[record.scorer], record.sequence
-        elif isinstance(record, Policy) and not settings.free:
+        if isinstance(record, Policy) and not settings.free:
             return self._permission, record.phase, self._permission + settings.ahead + 1
-        elif isinstance(record, StepRewards):
+        if isinstance(record, StepRewards):
             return self._labels.next, (record.phase, record.part), (self.phase, 0)
-        else:
+        numbers = self._arrived.due(record)
+        if numbers is None:
             return None
-        return due, number, due + (settings.ahead + 1) * settings.phase_steps
-
-    def _next(self, record: Any, due: 'Counter[str]', name: str) -> bool:
-        if record.sequence > due[name]:
-            raise RecordError(
-                f'{describe(record)} is out of sequence: {due[name]} is the next of {name!r}. '
-                f'What lies between never arrived: restart {name!r}'
-            )
-        if record.sequence < due[name]:
-            self._repeated(record)
-            return False
-        due[name] += 1
-        return True
-
-    def _repeated(self, record: Transitions | Judgement) -> None:
-        """Count a record that arrives again.
-
-        Raises:
-            RecordError: it is not the one that has come before.
-        """
-        if self._chain.contradicts(record):
-            _, name = publisher(record)
-            raise RecordError(
-                f'{describe(record)} is not the record of that number that has come from {name!r} '
-                'already: stop the second one of that name'
-            )
-        self.duplicated[TOPICS[type(record)]] += 1
+        return *numbers, numbers[0] + (settings.ahead + 1) * settings.phase_steps
 
     def work(self) -> Iterator[list[Record] | None]:
         """Yield a commit for each phase, in order, as soon as it is whole."""
@@ -362,17 +299,10 @@ class Recorder(Part):
         members = self._members(phase)
         if not members:
             return False
-        return all(
-            self._there(phase, source, steps) or self._left_out.is_out(source, phase)
-            for source, steps in members.items()
-        ) and any(self._there(phase, source, steps) for source, steps in members.items())
-
-    def _there(self, phase: int, source: str, steps: int) -> bool:
-        """Whether all steps and scores of a source are there."""
-        end = self._ended.get((phase, source))
-        if end is None or self._steps[phase, source] != steps:
-            return False
-        return self._scores[source] >= self._committed_scores[source] + end[1]
+        there = {s: self._arrived.all_of(phase, s, steps) for s, steps in members.items()}
+        return any(there.values()) and all(
+            there[source] or self._left_out.is_out(source, phase) for source in members
+        )
 
     def _commit(self, phase: int, recorded: Commit | None = None) -> Commit:
         """Commit a phase.
@@ -384,41 +314,30 @@ class Recorder(Part):
         steps = self._members(phase)
         members = sorted(steps)
         self._permitted.pop(phase, None)
-        last = []
-        scorers = set(self._scores)
         dropped = self._absent - set(members)
+        last = []
         for source in members:
-            scorers.add(source)
-            if not self._there(phase, source, steps[source]):
+            if self._arrived.all_of(phase, source, steps[source]):
+                last.append(self._arrived.commit(phase, source))
+            else:
                 dropped.add(source)
-                self._drop(phase, source)
-                last.append(self._transitions[source] - 1)
-                continue
-            sequence, due = self._ended.pop((phase, source))
-            del self._steps[phase, source]
-            last.append(sequence)
-            self._committed_scores[source] += due
-        waited_for = () if self._settings.scored_elsewhere else members
-        for scorer in scorers.difference(waited_for):  # a person, a robot itself: all so far
-            self._committed_scores[scorer] = self._scores[scorer]
+                last.append(self._arrived.drop(phase, source))
+        scores = self._arrived.committed_scores(members)
         self.phase = phase + 1  # at once: labels of the phase may be here before the next slice
-        names = tuple(sorted(s for s in scorers if self._committed_scores[s]))
-        scores = np.array([self._committed_scores[s] - 1 for s in names], np.int64)
         commit = self._chain.completed(
             Commit(
                 run_id=self._run.run_id,
                 phase=phase,
                 sources=tuple(members),
                 transitions=np.array(last, np.int64),
-                scorers=names,
-                scores=scores,
+                scorers=tuple(scores),
+                scores=np.array(list(scores.values()), np.int64),
                 dropped=tuple(sorted(dropped)),
             )
         )
         self._absent = dropped
         self._chain.follow(recorded or commit)
         self._labels.follow(phase)
-
         return commit
 
     @property
@@ -426,34 +345,13 @@ class Recorder(Part):
         """The next phase to be committed."""
         return self.phase
 
-    def _drop(self, phase: int, source: str) -> None:
-        """Drop what came of a source in a phase, and void the numbers of what may still come."""
-        self._counters['steps dropped'] += self._steps.pop((phase, source), 0)
-        self._counters['phases of a source dropped'] += 1
-        self._ended.pop((phase, source), None)
-        self._transitions[source] = voided(self._settings, self._transitions[source]) + 1
-        if not self._settings.scored_elsewhere:
-            self._scores[source] = voided(self._settings, self._scores[source]) + 1
-            self._committed_scores[source] = self._scores[source]
-
     def waiting_for(self) -> str:
         """What the recorder waits for, for people: what the next phase still lacks."""
         members = self._members(self.phase)
         if not members:
             return f'permission for phase {self.phase} from the learner'
-        lacks = []
-        for source, steps in members.items():
-            have = self._steps[self.phase, source]
-            if have < steps:
-                lacks.append(f'{steps - have} of {steps} steps of {source!r}')
-            elif (self.phase, source) in self._ended:
-                due = (
-                    self._committed_scores[source]
-                    + self._ended[self.phase, source][1]
-                    - self._scores[source]
-                )
-                if due > 0:
-                    lacks.append(f'{due} composite rewards of {source!r}')
+        parts = (self._arrived.lacks(self.phase, s, steps) for s, steps in members.items())
+        lacks = [part for part in parts if part]
         if self._lacks_labels(self.phase):
             lacks.append(f'labels of phase {self.phase - self._settings.lag} from the reward node')
         return f'the rest of phase {self.phase}' + (f': {", ".join(lacks)}' if lacks else '')
@@ -466,12 +364,9 @@ class Recorder(Part):
         return CoreReport(
             duplicated=dict(self.duplicated),
             refused=dict(self.refused),
-            counters={'phases_committed': self.phase, **self._left_over(), **self._counters},
+            counters={
+                'phases_committed': self.phase,
+                **self._arrived.left_over(),
+                **self._arrived.counters,
+            },
         )
-
-    def _left_over(self) -> dict[str, int]:
-        """Judgements that no commit has named: they came too late, or after a gap."""
-        gaps = sum(len(numbers.early) for numbers in self._numbers.values())
-        late = sum(n.next - self._committed_scores[name] for name, n in self._numbers.items())
-        counts = {'judgements after the last commit': late, 'judgements after a gap': gaps}
-        return {name: count for name, count in counts.items() if count}
