@@ -1,6 +1,5 @@
 """A node's place in a run: its identity, its run and the other nodes."""
 
-import hashlib
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,25 +8,18 @@ from typing import Any
 import numpy as np
 
 from codetr_ros.bags.definitions import stamp_of
-from codetr_ros.config import Settings, SettingsError, from_canonical
+from codetr_ros.config import Settings
 from codetr_ros.cores.core import Core
 from codetr_ros.nodes import leaving
 from codetr_ros.nodes.admission import Admission
+from codetr_ros.nodes.announced_run import SecondRunError, is_new
 from codetr_ros.nodes.catching_up import Fetcher
 from codetr_ros.nodes.errors import NodeError, first_cause
 from codetr_ros.nodes.outbox import Outbox
 from codetr_ros.nodes.patience import Limit, Patience
 from codetr_ros.nodes.peers import GAVE_UP, Peers
 from codetr_ros.nodes.traffic import Traffic
-from codetr_ros.records import (
-    PROTOCOL_VERSION,
-    Commit,
-    Presence,
-    Record,
-    RecordError,
-    RunSpec,
-    describe,
-)
+from codetr_ros.records import Commit, Presence, Record, RecordError, RunSpec
 from codetr_ros.records.bounds import LONGEST_DOING
 from codetr_ros.records.roles import READ_BY_ITSELF, published_by
 from codetr_ros.ros import given, link, parameters
@@ -290,47 +282,15 @@ class Membership:
     # ---- runs and peers
 
     def _note_run(self, spec: RunSpec, data: bytes) -> None:
-        own = self.run
-        if own is not None and spec.run_id == own.run_id:
-            if (spec.settings_hash, spec.seed) != (own.settings_hash, own.seed):
-                raise RecordError(
-                    f'run {spec.run_id!r} is announced again with other settings: stop the second '
-                    'learner'
-                )
-            self.traffic.received['run'] += 1  # of a learner that was started again
-            return
-        if spec.protocol_version != PROTOCOL_VERSION:
-            raise RecordError(
-                f'{describe(spec)}: run {spec.run_id!r} speaks protocol_version '
-                f'{spec.protocol_version}, {self.link.full_name} speaks {PROTOCOL_VERSION}: '
-                'install the same version of codetr_ros everywhere'
-            )
-        if hashlib.sha256(spec.settings.encode()).hexdigest() != spec.settings_hash:
-            raise RecordError(
-                f'run {spec.run_id!r}: settings_hash {spec.settings_hash!r} is not that of its '
-                'settings: install the same version of codetr_ros everywhere'
-            )
-        if own is not None:
-            problem = (
-                f'a second run in the namespace of {self.link.full_name}: {spec.run_id!r} '
-                f'beside {own.run_id!r}. Stop one of them, or give each run a namespace of its '
-                'own (--ros-args -r __ns:=/other)'
-            )
-            if self.role == 'learner' and not self.begun:
-                raise NodeError(problem)
-            raise RecordError(problem)
-        if self.values['run_id'] not in ('', spec.run_id):
-            raise RecordError(
-                f'run {spec.run_id!r} is not the one that {self.link.full_name} was started for '
-                f'(parameter run_id = {self.values["run_id"]!r}): leave run_id out, or start '
-                'that learner'
-            )
         try:
-            from_canonical(spec.settings, f'run {spec.run_id!r}')
-        except SettingsError as error:
-            raise RecordError(str(error)) from None
+            new = is_new(spec, self.run, self.values['run_id'], self.link.full_name)
+        except SecondRunError as error:
+            if self.role == 'learner' and not self.begun:
+                raise NodeError(str(error)) from None
+            raise
         self.traffic.received['run'] += 1
-        self.run, self.announcement = spec, data
+        if new:
+            self.run, self.announcement = spec, data
 
     def _note_peer(self, presence: Presence, stamp: int) -> None:
         if presence.instance_id == self.link.instance:
