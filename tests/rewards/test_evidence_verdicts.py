@@ -289,6 +289,34 @@ def test_a_scale_of_another_size_is_refused_by_name():
         made.load_state(state)
 
 
+def improving(seed: int, weights: F64) -> tuple[torch.Tensor, F64]:
+    """Mean features and stars of a policy that soon gets five of them in every segment."""
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(size=(160, len(weights)))
+    rows[:, 0] = 1
+    edges = np.quantile(rows[:20] @ weights, [0.2, 0.4, 0.6, 0.8])
+    rows[20:, 1] = -2 - 0.5 * np.abs(rows[20:, 1])
+    return torch.tensor(rows), 1.0 + np.searchsorted(edges, rows @ weights)
+
+
+@pytest.mark.parametrize('seed', [0, 3, 5])
+def test_while_verdicts_become_all_alike_fits_that_go_on_are_as_likely_as_those_begun_anew(seed):
+    """A fit that stops in the midst of its turns can be far off when the next ones come."""
+    weights = np.array([0, -1, 0.7, -0.5, 0.3, 0.2, 0, 0])
+    rows, scores = improving(seed, weights)
+    assert (scores[20:] == 5).mean() > 0.75
+    blocks = [slice(i, i + 1) for i in range(8)]
+    going_on = Model(links.make('sum', 1.0, 50, True), blocks)
+    for n in range(20, 161, 20):
+        sample = Sample(scores[:n], np.full(n, 50), rows[:n])
+        anew = Model(links.make('sum', 1.0, 50, True), blocks)
+        for model in (going_on, anew):
+            model.scale = going_on.scale
+            model.fit(sample, np.arange(n), True)
+        assert going_on.evidence > anew.evidence - 0.4
+        assert np.corrcoef(going_on.posterior.mean[1:], weights[1:])[0, 1] > 0.97
+
+
 def test_scores_of_any_value_are_no_verdicts():
     data = planted.memory(planted.progress, lambda r: float(r.sum()), segments=50)
     with pytest.raises(RewardModelError, match=r'50 different values .* evidence\.score_scale to'):

@@ -45,8 +45,12 @@ FEW = 200
 """Scores up to which a first fit has several beginnings."""
 HEAT_ROUNDS = 3
 """Rounds with each of them."""
-TURNS = (7, 2)
-"""Of learning levels and the scale of verdicts, in a first fit and in later ones."""
+MOST_TURNS = 12
+"""Of learning levels and the scale of verdicts: from both as they were fitted last, too, since
+verdicts that have come since may have changed both.
+"""
+SETTLED = 0.1
+"""Change [nats] of the likelihood of verdicts in a turn behind which there is no other one."""
 LEAST_LEFT = (1e-3, 0.2)
 """Of 1 - leverage, where a verdict is predicted from the others: for links that are linear, and
 for others. A few rounds of Gauss-Newton do not end where that would be exact, and without this and
@@ -171,8 +175,8 @@ class Model:
         places = torch.tensor(np.concatenate([some, count + np.arange(len(duels.outcomes))]))
         verdicts, turns, mean, variance = None, comparisons.TURNS, np.zeros(0), np.zeros(0)
         if ordinal:
-            verdicts, more, mean, variance = self._begin_verdicts(sample, levels)
-            turns = max(turns, more)
+            verdicts, mean, variance = self._begin_verdicts(sample, levels)
+            turns = max(turns, MOST_TURNS)
         apart, apart_variance = duels.before(deviation)
         for turn in range(turns):
             targets = Targets(levels, torch.zeros(count, dtype=torch.float64))
@@ -201,34 +205,37 @@ class Model:
         self.left_out_r2 = 1 - float(off @ off) / total if total > 0 else 0.0
         self.verdicts = verdicts
 
-    def _begin_verdicts(self, sample: Sample, levels: F64) -> tuple[Verdicts, int, F64, F64]:
-        """Where the turns of learning a scale of verdicts begin, and how many there are.
+    def _begin_verdicts(self, sample: Sample, levels: F64) -> tuple[Verdicts, F64, F64]:
+        """Where the turns of learning a scale of verdicts begin.
 
         Returns:
-            The scale, the turns, and mean and variance (S,) of the levels before their verdicts.
+            The scale, and mean and variance (S,) of the levels before their verdicts.
         """
         scores, known = sample.scores, self.verdicts
         if known is None or not np.array_equal(known.values, np.unique(scores)):
-            verdicts, turns = Verdicts.first(scores, levels), TURNS[0]
+            verdicts = Verdicts.first(scores, levels)
             mean = np.full(len(scores), levels.mean())
         else:
-            verdicts, turns = known, TURNS[1]
+            verdicts = known
             mean = self._predicted(sample)
-        return verdicts, turns, mean, np.full(len(scores), verdicts.spread)
+        return verdicts, mean, np.full(len(scores), verdicts.spread)
 
     def _fit_verdicts(self, sample: Sample, levels: F64, some: I64) -> None:
         """Fit to what verdicts state of levels, and learn their scale: in turns."""
         scores = sample.scores
-        verdicts, turns, mean, variance = self._begin_verdicts(sample, levels)
-        for turn in range(turns):
+        verdicts, mean, variance = self._begin_verdicts(sample, levels)
+        before = -math.inf
+        for _ in range(MOST_TURNS):
             targets = _sites(verdicts, scores, mean, variance)
             self._fit(sample, targets, some)
             mean, variance = self._left_out(sample, targets)
-            if turn < turns - 1:
-                verdicts, factor, shift = verdicts.followed(scores, levels, mean, variance)
-                mean, variance = mean * factor + shift, variance * factor**2
-        self.verdicts = verdicts
-        self.evidence = verdicts.log_likelihood(scores, mean, variance)
+            self.verdicts = verdicts
+            self.evidence = verdicts.log_likelihood(scores, mean, variance)
+            if abs(self.evidence - before) < SETTLED:
+                break
+            before = self.evidence
+            verdicts, factor, shift = verdicts.followed(scores, levels, mean, variance)
+            mean, variance = mean * factor + shift, variance * factor**2
 
     def _fit(self, sample: Sample, targets: 'Targets', some: I64) -> None:
         places = torch.tensor(some)
