@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from codetr_ros.simtest.disks import Trouble
 from codetr_ros.simtest.network import Weather
+from codetr_ros.simtest.place import Pace
 from codetr_ros.simtest.plan import Death, Plan, names_of
-from codetr_ros.simtest.process import Pace
 
 ROLES = ('sim', 'record', 'reward', 'learner', 'evaluate')
 

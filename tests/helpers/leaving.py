@@ -9,8 +9,8 @@ import torch
 
 from codetr_ros.simtest.disks import Trouble
 from codetr_ros.simtest.network import Weather
+from codetr_ros.simtest.place import Pace
 from codetr_ros.simtest.plan import Plan, all_settings, plan
-from codetr_ros.simtest.process import Pace
 from codetr_ros.simtest.run import Outcome, Simulated
 
 WITH_TWO = [i for i, each in enumerate(all_settings()) if each.simulators == 2]

@@ -5,8 +5,8 @@ from dataclasses import replace
 from codetr_ros.simtest.disks import Trouble
 from codetr_ros.simtest.losing import losing
 from codetr_ros.simtest.network import Weather
+from codetr_ros.simtest.place import Pace
 from codetr_ros.simtest.plan import Plan, names_of
-from codetr_ros.simtest.process import Pace
 
 
 def slow_and_losing(seed: int) -> Plan:

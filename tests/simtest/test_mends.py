@@ -31,8 +31,8 @@ from codetr_ros.simtest import disks, process
 from codetr_ros.simtest.disks import Trouble
 from codetr_ros.simtest.losing import losing
 from codetr_ros.simtest.network import Weather
+from codetr_ros.simtest.place import Pace
 from codetr_ros.simtest.plan import Death, all_settings, names_of, plan
-from codetr_ros.simtest.process import Pace
 from codetr_ros.simtest.run import carry_out, undisturbed
 from helpers.deaths import deadly
 from helpers.slow_runs import far_apart, slow_and_losing

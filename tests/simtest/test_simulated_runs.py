@@ -11,8 +11,8 @@ import pytest
 from codetr_ros.simtest.disks import Trouble
 from codetr_ros.simtest.losing import losing
 from codetr_ros.simtest.network import Weather
+from codetr_ros.simtest.place import Pace
 from codetr_ros.simtest.plan import DEADLINE, all_settings, plan
-from codetr_ros.simtest.process import Pace
 from codetr_ros.simtest.run import carry_out, simulate
 from helpers.slow_runs import far_apart, slow_and_losing
 

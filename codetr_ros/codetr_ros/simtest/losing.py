@@ -5,8 +5,8 @@ from dataclasses import replace
 
 from codetr_ros.simtest.disks import Trouble
 from codetr_ros.simtest.network import Weather
+from codetr_ros.simtest.place import Pace
 from codetr_ros.simtest.plan import BUSY, Death, Plan, names_of, plan
-from codetr_ros.simtest.process import Pace
 
 
 def losing(seed: int, share: float = 0.2) -> Plan:

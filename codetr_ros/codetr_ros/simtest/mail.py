@@ -7,7 +7,8 @@ from codetr_ros.bags.definitions import decode, encode, stamp_of
 from codetr_ros.bags.topics import RECORDED
 from codetr_ros.records import CompositeReward, Presence, Record, Transitions
 from codetr_ros.simtest.network import FORGED, Handle, Network, Weather
-from codetr_ros.simtest.process import Packet, Process
+from codetr_ros.simtest.place import Packet
+from codetr_ros.simtest.process import Process
 from codetr_ros.simtest.world import World
 
 STRANGER = 'stranger'

@@ -8,7 +8,7 @@ from typing import Any
 from codetr_ros.config import Settings
 from codetr_ros.simtest.disks import Trouble
 from codetr_ros.simtest.network import LEASE, Partition, Weather
-from codetr_ros.simtest.process import Pace
+from codetr_ros.simtest.place import Pace
 from codetr_ros.simtest.task import TASK
 
 DEADLINE = 60.0

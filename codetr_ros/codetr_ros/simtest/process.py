@@ -6,13 +6,12 @@ what is missing, work one slice, publish what came out.
 
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from codetr_ros.bags.definitions import encode
-from codetr_ros.config import Settings, queues
+from codetr_ros.config import queues
 from codetr_ros.cores.core import Core
 from codetr_ros.cores.simulator import Simulator
 from codetr_ros.nodes.asking import SERVICE, Answer, answer_to
@@ -32,89 +31,16 @@ from codetr_ros.nodes.restoring import (
 )
 from codetr_ros.nodes.traffic import Traffic
 from codetr_ros.nodes.waiting import Waiting
-from codetr_ros.records import TOPICS, Commit, Presence, Record, RunSpec, describe
+from codetr_ros.records import TOPICS, Commit, Presence, Record, describe
 from codetr_ros.records.roles import READ_BY_ITSELF, published_by
 from codetr_ros.simtest.asking import Asker, FetchAnswer, FetchRequest
 from codetr_ros.simtest.disks import KilledError
 from codetr_ros.simtest.network import KEPT_FOR_LATE
+from codetr_ros.simtest.place import Packet, Place
 from codetr_ros.simtest.world import World
 
 PRESENCE_EVERY = 1.0  # [s]
 IDLE = 0.5  # [s] between two turns of a node that waits
-
-
-@dataclass(frozen=True)
-class Packet:
-    """A message on its way.
-
-    Attributes:
-        kind: what it carries.
-        number: one for each message, by which a second copy shows.
-        data: CDR; a record as it is for presences, which are many.
-        stamp: when a presence was published [ns].
-    """
-
-    kind: type
-    number: int
-    data: Any
-    stamp: int = 0
-
-
-class Mail(Protocol):
-    """Brings what a node publishes to the others."""
-
-    def publish(self, sender: 'Process', packet: Packet) -> None:
-        """Send a message to everybody who reads its kind."""
-
-    def send(self, sender: 'Process', reader: str, packet: Packet) -> None:
-        """Send a request or an answer to one node."""
-
-
-@dataclass
-class Pace:
-    """How quickly a node works.
-
-    Attributes:
-        begins: when it starts [s].
-        slice_seconds: what a slice takes, on average [s].
-        stalls: when it takes no turn: from when, for how long [s].
-    """
-
-    begins: float = 0.0
-    slice_seconds: float = 0.02
-    stalls: list[tuple[float, float]] = field(default_factory=list)
-
-    def stalled_until(self, now: float) -> float | None:
-        """The end of the stall that it is in [s]; None if it is in none."""
-        ends = [begin + length for begin, length in self.stalls if begin <= now < begin + length]
-        return max(ends, default=None)
-
-
-@dataclass(frozen=True)
-class Place:
-    """Where a node is, and who it is.
-
-    Attributes:
-        world: the world.
-        mail: brings what it publishes.
-        run: the run.
-        settings: its settings.
-        role: one of `records.ROLES`.
-        name: its name.
-        pace: how quickly it works.
-        deadline: how long it waits for others [s].
-        instance: which start of the node this is: 1, 2, ...
-    """
-
-    world: World
-    mail: Mail
-    run: RunSpec
-    settings: Settings
-    role: str
-    name: str
-    pace: Pace
-    deadline: float
-    instance: int = 1
 
 
 class _Log:

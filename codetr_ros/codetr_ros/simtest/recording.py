@@ -17,7 +17,8 @@ from codetr_ros.records import TOPICS, Commit, Record, RunSpec
 from codetr_ros.records.digests import digest
 from codetr_ros.simtest.asking import FetchRequest
 from codetr_ros.simtest.disks import TroubledDisk
-from codetr_ros.simtest.process import Place, Process
+from codetr_ros.simtest.place import Place
+from codetr_ros.simtest.process import Process
 
 CHUNK_BYTES = 2048
 """So small that a phase has several chunks."""

@@ -31,8 +31,9 @@ from codetr_ros.runs.checkpoints import CheckpointError, every, latest
 from codetr_ros.simtest import checks
 from codetr_ros.simtest.disks import KilledError, Trouble, TroubledDisk
 from codetr_ros.simtest.mail import Post
+from codetr_ros.simtest.place import Pace, Place
 from codetr_ros.simtest.plan import BACK, DEADLINE, Death, Plan, names_of, plan
-from codetr_ros.simtest.process import Pace, Place, Process
+from codetr_ros.simtest.process import Process
 from codetr_ros.simtest.recording import Recording
 from codetr_ros.simtest.replay import replayed
 from codetr_ros.simtest.world import World
