@@ -139,7 +139,8 @@ def stars(kind: str, edges: F64, **how: object) -> Trajectories:
     """Segments of which one of a few verdicts is told."""
 
     def verdict(rewards: F64) -> float:
-        return 1.0 + float(np.searchsorted(edges, composite(kind, rewards, 3.0, 10)))
+        longest = max(10, len(rewards))
+        return 1.0 + float(np.searchsorted(edges, composite(kind, rewards, 3.0, longest)))
 
     return planted.memory(planted.progress, verdict, **how)
 
@@ -192,6 +193,21 @@ def test_fits_of_maxima_to_verdicts_do_not_diverge(seed):
     made.prepare(data)
     assert planted.within(made, data) > 0.6
     assert str(made.report()['depends_on']).startswith("s'[8] +")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('seed', range(3))
+def test_fits_to_verdicts_about_maxima_that_are_mostly_alike_keep_the_likeliest_turn(seed):
+    """Their turns go back and forth, and do not settle."""
+    edges = np.array([-0.5, 0.0, 0.5, 2.0])
+    made = registry.make(builders.tiny(**SETTINGS | {'composite': 'max', 'delay': 25}), O, A)
+    assert isinstance(made, Evidence)
+    for segments in (60, 100, 140):
+        data = stars('max', edges, delay=25, segments=segments, noise=0.1, seed=seed)
+        scores = data.segments.scores(data.segments.ids())
+        assert (scores == 4).mean() > 0.7
+        made.prepare(data)
+        assert planted.within(made, data) > 0.9
 
 
 def test_on_a_lopsided_scale_credit_is_better_than_with_stars_taken_for_numbers():

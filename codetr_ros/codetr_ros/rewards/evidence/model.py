@@ -51,6 +51,12 @@ verdicts that have come since may have changed both.
 """
 SETTLED = 0.1
 """Change [nats] of the likelihood of verdicts in a turn behind which there is no other one."""
+IN_VAIN = 4
+"""Turns that are not better than one before behind which there is no other one: fits whose links
+are not linear may go back and forth for ever.
+"""
+AS_LIKELY = 1.0
+"""Difference [nats] up to which the last of the turns is kept rather than the likeliest."""
 LEAST_LEFT = (1e-3, 0.2)
 """Of 1 - leverage, where a verdict is predicted from the others: for links that are linear, and
 for others. A few rounds of Gauss-Newton do not end where that would be exact, and without this and
@@ -224,18 +230,28 @@ class Model:
         """Fit to what verdicts state of levels, and learn their scale: in turns."""
         scores = sample.scores
         verdicts, mean, variance = self._begin_verdicts(sample, levels)
-        before = -math.inf
+        turns: list[Model] = []
         for _ in range(MOST_TURNS):
             targets = _sites(verdicts, scores, mean, variance)
             self._fit(sample, targets, some)
             mean, variance = self._left_out(sample, targets)
             self.verdicts = verdicts
             self.evidence = verdicts.log_likelihood(scores, mean, variance)
-            if abs(self.evidence - before) < SETTLED:
+            turns.append(self._as_it_is())
+            likely = [turn.evidence for turn in turns]
+            settled = len(turns) > 1 and abs(likely[-1] - likely[-2]) < SETTLED
+            if settled or len(turns) - 1 - int(np.argmax(likely)) >= IN_VAIN:
                 break
-            before = self.evidence
             verdicts, factor, shift = verdicts.followed(scores, levels, mean, variance)
             mean, variance = mean * factor + shift, variance * factor**2
+        if max(likely) > self.evidence + AS_LIKELY:
+            vars(self).update(vars(turns[int(np.argmax(likely))]))
+
+    def _as_it_is(self) -> 'Model':
+        """A copy that stays as it is: only the link changes in place."""
+        made = copy.copy(self)
+        made.link = copy.copy(self.link)
+        return made
 
     def _fit(self, sample: Sample, targets: 'Targets', some: I64) -> None:
         places = torch.tensor(some)
