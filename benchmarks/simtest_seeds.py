@@ -12,6 +12,7 @@ nodes are killed (`simtest/losing.py`). A run that ends by a named cause has fai
 """
 
 import argparse
+import gc
 import platform
 import subprocess
 import sys
@@ -78,6 +79,8 @@ def main(arguments: list[str] | None = None, out: Path | None = None) -> int:
         version_of('codetr_ros'), platform.python_version(), version_of('torch'),
         platform.machine(),
     )  # fmt: skip
+    block(0, 0, drawn)  # everything is imported
+    gc.freeze()  # and need not be looked at again and again
     failed = 0
     for first in range(given.begin, given.end, given.block):
         last = min(first + given.block, given.end) - 1

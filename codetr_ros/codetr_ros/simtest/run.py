@@ -128,6 +128,7 @@ class Simulated:
         self._torn: set[Path] = set()  # checkpoints that are damaged on purpose
         self._checkpoints = folder.parent / run_folder.CHECKPOINTS if keeps else None
         self._dead = 0  # processes that will be there again
+        self._going: Process | None = None  # one that has not ended
         self.processes: dict[str, Process] = {}
         self.post.processes = self.processes
         self.post.watch = self._watch
@@ -268,7 +269,9 @@ class Simulated:
         return Outcome(self.plan, failures, gave_up, self.world.now, trace)
 
     def _all_ended(self) -> bool:
-        return all(each.ended for each in self.processes.values())
+        if self._going is None or self._going.ended:  # asked for after every event
+            self._going = next((p for p in self.processes.values() if not p.ended), None)
+        return self._going is None
 
     def _named(self, text: str) -> str:
         """A text without the name of the folder, which differs from run to run."""
