@@ -79,8 +79,6 @@ def main(arguments: list[str] | None = None, out: Path | None = None) -> int:
         version_of('codetr_ros'), platform.python_version(), version_of('torch'),
         platform.machine(),
     )  # fmt: skip
-    block(0, 0, drawn)  # everything is imported
-    gc.freeze()  # and need not be looked at again and again
     failed = 0
     for first in range(given.begin, given.end, given.block):
         last = min(first + given.block, given.end) - 1
@@ -93,4 +91,6 @@ def main(arguments: list[str] | None = None, out: Path | None = None) -> int:
 
 
 if __name__ == '__main__':
+    block(0, 0, plan)  # everything is imported,
+    gc.freeze()  # and need not be looked at again and again
     sys.exit(main())
