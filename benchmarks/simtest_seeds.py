@@ -91,6 +91,5 @@ def main(arguments: list[str] | None = None, out: Path | None = None) -> int:
 
 
 if __name__ == '__main__':
-    block(0, 0, plan)  # everything is imported,
-    gc.freeze()  # and need not be looked at again and again
+    gc.freeze()  # what is imported need not be looked at again and again
     sys.exit(main())

@@ -62,6 +62,10 @@ class Numbers:
             self.whole = max(self.whole, last + 1)
         self.next = max(self.next, last + 1)
 
+    def commit(self, last: int) -> None:
+        """Everything up to this number belongs to the phases committed so far."""
+        self.committed = max(self.committed, last)
+
     def finish(self, place: Any) -> None:
         """Report what never came."""
 
@@ -304,7 +308,7 @@ class SourceChecks:
 
     def commit(self, last: int) -> None:
         """Everything up to this sequence number belongs to the phases committed so far."""
-        self.numbers.committed = max(self.committed, last)
+        self.numbers.commit(last)
         if not self._has_true:
             for sequence in [n for n in self._chunks if n <= last]:
                 del self._chunks[sequence]

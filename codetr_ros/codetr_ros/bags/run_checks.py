@@ -256,7 +256,7 @@ class RunChecks:
             there = self._scorers.get(name)
             whole &= self._named('composite rewards', name, last, there, record.phase, place)
             if there is not None:
-                there.committed = max(there.committed, last)
+                there.commit(last)
         self.whole += whole
         self._digests(record, place)
 

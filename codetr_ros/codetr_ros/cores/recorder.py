@@ -165,16 +165,13 @@ class Recorder(Part):
         Returns:
             The names of those that are left out now and were not before.
         """
-        members = self._members(self.phase)
-        there = any(self._arrived.all_of(self.phase, source, n) for source, n in members.items())
-        if not self._tasks.known or not there:
+        there = self._there(self.phase)
+        if not self._tasks.known or not any(there.values()):
             return []
         new = [
             source
-            for source, steps in members.items()
-            if source in sources
-            and not self._arrived.all_of(self.phase, source, steps)
-            and not self._left_out.is_out(source, self.phase)
+            for source, whole in there.items()
+            if source in sources and not whole and not self._left_out.is_out(source, self.phase)
         ]
         self._left_out.leave_out(new, self.phase)
         return new
@@ -296,13 +293,15 @@ class Recorder(Part):
 
     def _rolled_out(self, phase: int) -> bool:
         """Whether all steps and scores of a phase are there."""
-        members = self._members(phase)
-        if not members:
-            return False
-        there = {s: self._arrived.all_of(phase, s, steps) for s, steps in members.items()}
+        there = self._there(phase)
         return any(there.values()) and all(
-            there[source] or self._left_out.is_out(source, phase) for source in members
+            whole or self._left_out.is_out(source, phase) for source, whole in there.items()
         )
+
+    def _there(self, phase: int) -> dict[str, bool]:
+        """Whether all of each source in a phase is there; none as long as they are not known."""
+        members = self._members(phase)
+        return {s: self._arrived.all_of(phase, s, steps) for s, steps in members.items()}
 
     def _commit(self, phase: int, recorded: Commit | None = None) -> Commit:
         """Commit a phase.

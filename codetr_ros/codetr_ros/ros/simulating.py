@@ -34,5 +34,5 @@ class Simulating(Wiring):
         return super().waits()
 
     def over(self) -> bool:
-        """Whether the run has ended without it: a robot need not go on for nobody."""
+        """Whether the run has ended without it: then no robot goes on for nobody."""
         return self._behind.over(self.member.peers)

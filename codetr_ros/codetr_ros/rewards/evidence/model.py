@@ -182,7 +182,7 @@ class Model:
         verdicts, turns, mean, variance = None, comparisons.TURNS, np.zeros(0), np.zeros(0)
         if ordinal:
             verdicts, mean, variance = self._begin_verdicts(sample, levels)
-            turns = max(turns, MOST_TURNS)
+            turns = MOST_TURNS
         apart, apart_variance = duels.before(deviation)
         for turn in range(turns):
             targets = Targets(levels, torch.zeros(count, dtype=torch.float64))
@@ -230,22 +230,25 @@ class Model:
         """Fit to what verdicts state of levels, and learn their scale: in turns."""
         scores = sample.scores
         verdicts, mean, variance = self._begin_verdicts(sample, levels)
-        turns: list[Model] = []
-        for _ in range(MOST_TURNS):
+        best, since, before = self, 0, -math.inf
+        for turn in range(MOST_TURNS):
+            if turn:
+                verdicts, factor, shift = verdicts.followed(scores, levels, mean, variance)
+                mean, variance = mean * factor + shift, variance * factor**2
             targets = _sites(verdicts, scores, mean, variance)
             self._fit(sample, targets, some)
             mean, variance = self._left_out(sample, targets)
             self.verdicts = verdicts
             self.evidence = verdicts.log_likelihood(scores, mean, variance)
-            turns.append(self._as_it_is())
-            likely = [turn.evidence for turn in turns]
-            settled = len(turns) > 1 and abs(likely[-1] - likely[-2]) < SETTLED
-            if settled or len(turns) - 1 - int(np.argmax(likely)) >= IN_VAIN:
+            if not turn or self.evidence > best.evidence:
+                best, since = self._as_it_is(), 0
+            else:
+                since += 1
+            if abs(self.evidence - before) < SETTLED or since >= IN_VAIN:
                 break
-            verdicts, factor, shift = verdicts.followed(scores, levels, mean, variance)
-            mean, variance = mean * factor + shift, variance * factor**2
-        if max(likely) > self.evidence + AS_LIKELY:
-            vars(self).update(vars(turns[int(np.argmax(likely))]))
+            before = self.evidence
+        if best.evidence > self.evidence + AS_LIKELY:
+            vars(self).update(vars(best))
 
     def _as_it_is(self) -> 'Model':
         """A copy that stays as it is: only the link changes in place."""
